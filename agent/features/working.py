@@ -1,0 +1,55 @@
+"""The grid that matching works on: cells of about 10 cm, whatever the map's own resolution, padded with the unknown.
+
+Positions here are in the *grid frame*: metres from the lower-left corner of the map's cell (0, 0), along its own axes.  Only
+`MapSnapshot` knows where that corner lies in the map frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.grid import FREE, OCCUPIED, OccupancyGrid
+
+WORKING_RESOLUTION_M = 0.10  # finer cells cost four times the work and gain no accuracy: walls are fitted below the cell
+MAX_WORKING_CELLS = 16_000_000  # a 400 m square; larger maps are worked on with coarser cells
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WorkingGrid:
+    """Occupied and free as 0/1 images, `resolution_m` a cell, a multiple of the map's."""
+
+    occupied: NDArray[np.uint8]  # (H, W)
+    free: NDArray[np.uint8]  # (H, W)
+    resolution_m: float
+
+    @staticmethod
+    def of(grid: OccupancyGrid) -> WorkingGrid:
+        factor = _factor(grid)
+        occupied = (grid.cells == OCCUPIED).view(np.uint8)
+        free = (grid.cells == FREE).view(np.uint8)
+        if factor > 1:
+            occupied = _block_sums(occupied, factor) > 0
+            free = (_block_sums(free, factor) * 2 >= factor * factor) & ~occupied
+        return WorkingGrid(
+            np.ascontiguousarray(occupied).view(np.uint8),
+            np.ascontiguousarray(free).view(np.uint8),
+            grid.resolution_m * factor,
+        )
+
+
+def _factor(grid: OccupancyGrid) -> int:
+    factor = max(1, int(WORKING_RESOLUTION_M / grid.resolution_m + 1e-6))
+    while grid.cells.size > MAX_WORKING_CELLS * factor * factor:
+        factor += 1
+    return factor
+
+
+def _block_sums(mask: NDArray[np.uint8], k: int) -> NDArray[np.int32]:
+    """Sums over k x k blocks; the last row and column of blocks may hang over the edge."""
+    h, w = mask.shape
+    padded = np.pad(mask, ((0, -h % k), (0, -w % k)))
+    by_rows = np.add.reduceat(padded, np.arange(0, padded.shape[0], k), axis=0, dtype=np.int32)
+    return np.add.reduceat(by_rows, np.arange(0, padded.shape[1], k), axis=1, dtype=np.int32)
