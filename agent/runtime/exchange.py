@@ -137,7 +137,7 @@ class Exchange:
         config = zenoh_config(self.settings)
         config["connect"]["endpoints"] = list(connect)
         try:
-            session = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+            session: Any = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
         except zenoh.ZError as error:
             listen = ", ".join(self.settings.endpoints()) or "nothing"
             raise ExchangeError(

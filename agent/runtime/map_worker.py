@@ -1,0 +1,60 @@
+"""The mapper's thread: readings in, the newest estimate out.
+
+Nothing but readings and a person's command reaches this thread: a slow network or a long match leaves mapping alone.
+"""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections.abc import Callable
+
+from agent.mapping.mapper import Mapper
+from agent.mapping.types import MapEstimate
+from agent.runtime.latest import Latest
+from agent.runtime.sensing import Readings
+
+WAIT_S = 0.25
+WAIT_FOR_ODOMETRY_S = 0.12  # two samples of a 20 Hz encoder board
+ESTIMATE_PERIOD_S = 1.0  # an estimate copies the whole grid; peers and the page need no more
+
+
+class MapWorker:
+    """Owns the mapper.  Others ask through `call`, and are served between two scans."""
+
+    def __init__(self, mapper: Mapper, readings: Readings, estimate_period_s: float = ESTIMATE_PERIOD_S) -> None:
+        self.mapper = mapper
+        self.estimates: Latest[MapEstimate] = Latest()  # for the snapshot worker
+        self.newest: MapEstimate | None = None  # for whoever looks; replaced as a whole
+        self.is_paused = False
+        self.scans = 0
+        self.scan_cpu_s = 0.0  # CPU of this thread spent on scans
+        self._readings = readings
+        self._period_s = estimate_period_s
+        self._next_estimate_s = 0.0
+        self._calls: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+
+    def call(self, action: Callable[[], None]) -> None:
+        """Run `action` on this thread, between two scans."""
+        self._calls.put(action)
+
+    def step(self) -> None:
+        while not self._calls.empty():
+            self._calls.get()()
+        odometry, scan = self._readings.take(WAIT_S, WAIT_FOR_ODOMETRY_S)
+        for sample in odometry:
+            self.mapper.add_odometry(sample)
+        if scan is None or self.is_paused:
+            return
+        started = time.thread_time()
+        self.mapper.add_scan(scan)
+        self.scan_cpu_s += time.thread_time() - started
+        self.scans += 1
+        now = time.monotonic()
+        if now >= self._next_estimate_s:
+            self._next_estimate_s = now + self._period_s
+            self.publish()
+
+    def publish(self) -> None:
+        self.newest = self.mapper.estimate()
+        self.estimates.put(self.newest)

@@ -1,0 +1,114 @@
+"""What survives kill -9 and a power cut: named values on disk, two generations each, every one with its checksum.
+
+    magic "mqst" | version u16 | length u64 | sha256 (32) | payload          <name>.<generation>.state
+
+A value is written aside, flushed, renamed into place, and the directory is flushed; the older generation is deleted only
+then.  A file that does not read as written is set aside as `*.bad` and the generation before it is used: state never
+keeps a robot from starting.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import logging
+import os
+import re
+import struct
+from pathlib import Path
+
+log = logging.getLogger(__name__)
+
+HEADER = struct.Struct("<4sHQ32s")
+MAGIC = b"mqst"
+VERSION = 1
+KEPT = 2
+MAX_BYTES = 512 * 1024 * 1024
+
+
+class StateDirectory:
+    """One directory of one robot.  A disk that fails makes `save` return False, never raise: mapping goes on in memory."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.last_error = ""
+
+    def save(self, name: str, payload: bytes) -> bool:
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            generations = self._generations(name)
+            newest = generations[0][0] if generations else 0
+            self._write(self.folder / f"{name}.{newest + 1}.state", payload)
+            for _, path in generations[KEPT - 1 :]:
+                path.unlink(missing_ok=True)
+        except OSError as error:
+            if not self.last_error:
+                log.warning("state: cannot save %s in %s: %s; goes on in memory", name, self.folder, error)
+            self.last_error = str(error)
+            return False
+        if self.last_error:
+            log.info("state: saving works again in %s", self.folder)
+        self.last_error = ""
+        return True
+
+    def load(self, name: str) -> bytes | None:
+        """The newest generation that reads as written; None when there is none."""
+        try:
+            generations = self._generations(name)
+        except OSError:
+            return None
+        for _, path in generations:
+            try:
+                return unpack(path.read_bytes())
+            except (OSError, CorruptState) as error:
+                log.warning("state: %s is set aside: %s", path, error)
+                with contextlib.suppress(OSError):
+                    path.replace(path.with_suffix(".bad"))
+        return None
+
+    def forget(self, name: str) -> None:
+        """Delete every generation of a name."""
+        with contextlib.suppress(OSError):
+            for _, path in self._generations(name):
+                path.unlink(missing_ok=True)
+
+    def _generations(self, name: str) -> list[tuple[int, Path]]:
+        """(number, file), newest first."""
+        pattern = re.compile(re.escape(name) + r"\.(\d{1,18})\.state")
+        if not self.folder.is_dir():
+            return []
+        found = [(int(match[1]), path) for path in self.folder.iterdir() if (match := pattern.fullmatch(path.name))]
+        return sorted(found, reverse=True)
+
+    def _write(self, path: Path, payload: bytes) -> None:
+        aside = path.with_suffix(".tmp")
+        with aside.open("wb") as file:
+            file.write(pack(payload))
+            file.flush()
+            os.fsync(file.fileno())
+        aside.replace(path)
+        directory = os.open(self.folder, os.O_RDONLY)
+        try:
+            os.fsync(directory)
+        finally:
+            os.close(directory)
+
+
+class CorruptState(Exception):
+    """A state file does not read as it was written."""
+
+
+def pack(payload: bytes) -> bytes:
+    return HEADER.pack(MAGIC, VERSION, len(payload), hashlib.sha256(payload).digest()) + payload
+
+
+def unpack(data: bytes) -> bytes:
+    if len(data) < HEADER.size:
+        raise CorruptState(f"{len(data)} bytes are less than a header")
+    magic, version, length, digest = HEADER.unpack_from(data)
+    payload = data[HEADER.size :]
+    if magic != MAGIC or version != VERSION:
+        raise CorruptState(f"magic {magic!r}, version {version}")
+    if length != len(payload) or length > MAX_BYTES or hashlib.sha256(payload).digest() != digest:
+        raise CorruptState(f"{len(payload)} of {length} bytes, checksum differs")
+    return payload
