@@ -1,0 +1,40 @@
+"""How the fleet logic behaves; each default is a decision with its reason."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class FleetOptions:
+    """Times in seconds of the local monotonic clock; no time of a peer is ever compared with ours."""
+
+    is_frozen: bool = False  # this coordinator speaks for a given map: it never grows, never moves, roots its group
+    beat_period_s: float = 1.0  # loss of one hint heals within about this
+    beat_jitter: float = 0.2  # share of the period; keeps a fleet from beating in step
+    max_beats_per_s: float = 40.0  # larger fleets beat slower, so that a robot never hears more than this
+    suspect_after_beats: float = 4.0
+    lost_after_s: float = 15.0  # network stalls of 10 s are normal and mean nothing
+    announce_period_s: float = 2.0  # a growing map is announced at most this often
+    pull_period_s: float = 2.0  # a growing map of one peer is pulled at most this often
+    compose_period_s: float = 2.0  # the global map is composed at most this often
+    fetch_timeout_s: float = 40.0  # a runtime that never answers a Fetch is not waited for longer
+    max_bulk_fetches: int = 2  # more only share the same radio
+    max_small_fetches: int = 8
+    retry_growth: float = 0.10  # a pair that did not fit is tried again when a map has grown by this share
+    retry_period_s: float = 3.0  # and not sooner than this
+    reverify_growth: float = 0.05  # a live edge is checked again when a map has grown by this share
+    reverify_period_s: float = 3.0
+    renew_growth: float = 0.30  # a live edge is proposed anew, with better figures, when the overlap has grown by this
+    coarse_hopeful_score: float = 4.0  # metres of agreeing wall at 20 cm below which the fine map is not pulled at once
+    coarse_skip_bytes: int = 8_192  # a fine map this small is pulled at once: the coarse one costs as much
+    max_edges: int = 6  # per robot: enough loops to find a wrong edge, few enough to keep verified
+    max_held_maps: int = 24  # larger groups take the global map from its composer instead of every member's map
+    max_peers: int = 1_024
+    min_match_factor: float = 0.85  # the paper's; equation (3)
+    same_transform_m: float = 0.5  # two transforms of one pair are the same within these
+    same_transform_rad: float = 0.06
+    max_new_conflict: float = 0.02  # a new revision of a member may disagree with our own cells by this much more than before
+    quarantine_strikes: int = 3  # provable untruths before a peer's statements are no longer heard
+    quarantine_s: float = 300.0
+    seed: int = 0  # of the jitter
