@@ -110,7 +110,9 @@ def _pixel_map(
             [0.0, 0.0, 1.0],
         ]
     )
-    return ((T_grid_target @ to_metres) / source_resolution_m - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]))[:2]
+    M: NDArray[np.float64] = (T_grid_target @ to_metres)[:2] / source_resolution_m
+    M[:, 2] -= 0.5
+    return M
 
 
 def _sampled(image: NDArray[np.uint8], M: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.uint8]:
