@@ -111,54 +111,6 @@ class Driver(Protocol):
     def feed(self, data: bytes, now_s: float) -> list[Reading]: ...
 
 
-@dataclass(frozen=True, slots=True)
-class WheelGeometry:
-    """What one tick of each wheel means."""
-
-    left_m_per_tick: float
-    right_m_per_tick: float
-    track_m: float
-
-
-@dataclass(frozen=True, slots=True)
-class TickSample:
-    """Both wheel counters as the device gave them, at its full width.
-
-    `device_s` is the device's own clock in seconds, if it has one (it may wrap, see `WheelCodec.clock_period_s`).
-    `is_reset` marks the first sample after the device says it has booted or its counters were set.
-    """
-
-    left: int
-    right: int
-    device_s: float | None = None
-    is_reset: bool = False
-    is_fault: bool = False  # the device itself says an encoder is broken
-
-
-class WheelCodec(Protocol):
-    """A base or encoder board: bytes to `TickSample`.  `hw.odometry.WheelDriver` makes `Odometry` and a `Driver` of it."""
-
-    bauds: tuple[int, ...]
-    counters: Counters
-    identity: Identity
-    period_s: float
-    count_bits: int  # 16 or 32: where the counters wrap
-    clock_period_s: float | None  # where `device_s` wraps; None: no clock
-    geometry: WheelGeometry | None  # known for a given base, or told by an info frame; None: the URL must say
-    open_dtr: bool | None
-    poll_period_s: float | None
-
-    def start(self) -> Script: ...
-
-    def stop(self) -> Script: ...
-
-    def restart(self) -> None: ...
-
-    def poll(self) -> bytes: ...
-
-    def feed(self, data: bytes, now_s: float) -> list[TickSample]: ...
-
-
 @dataclass(slots=True)
 class DriverBase:
     """The parts most drivers share; a streaming device that needs no command inherits them all."""

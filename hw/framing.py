@@ -7,8 +7,8 @@ header, because the true frame may begin inside the false one:
     .. 54 2C xx xx [54 2C .. good .. crc] ..
        ^ checksum fails: skip one byte, not 47
 
-`fixed_frames` does this for many frames of one length at once: it judges every candidate position in numpy and then walks
-over the good ones, which gives exactly what the byte-at-a-time search gives.
+`FixedFrames` does this for frames of one length.  A few bytes are searched byte by byte; much at once is judged at every
+candidate position in numpy, which then walks over the good ones: exactly the same frames, sixty times faster.
 """
 
 from __future__ import annotations
@@ -32,25 +32,19 @@ class Counters:
     skipped_bytes: int = 0  # bytes that belonged to no good frame
     resyncs: int = 0  # times a good frame came after skipped bytes
     rejected: int = 0  # frames with a good checksum and impossible content
-    is_skipping: bool = False
+    gap_bytes: int = 0  # skipped since the last good frame
 
     def skip(self, n: int) -> None:
         """Count bytes that belong to no frame."""
-        if n > 0:
-            self.skipped_bytes += n
-            self.is_skipping = True
+        self.skipped_bytes += n
+        self.gap_bytes += n
 
-    def good(self, n: int = 1) -> None:
-        """Count good frames; the first one after skipped bytes is a resync."""
-        self.frames += n
-        if self.is_skipping:
-            self.resyncs += 1
-            self.is_skipping = False
-
-    @property
-    def trouble(self) -> int:
-        """Everything that says the line is not clean; compare two readings of it."""
-        return self.bad_frames + self.skipped_bytes + self.rejected
+    def good(self) -> int:
+        """Count a good frame; the answer is how many bytes were skipped right before it."""
+        gap, self.gap_bytes = self.gap_bytes, 0
+        self.frames += 1
+        self.resyncs += gap > 0
+        return gap
 
 
 class ByteWindow:
@@ -73,13 +67,17 @@ class ByteWindow:
         """Add what has arrived."""
         self._counters.bytes_in += len(data)
         self._data += data
+
+    def trim(self) -> None:
+        """Skip the oldest bytes beyond the limit; called when all that can be understood was taken."""
         if len(self._data) > self._limit:
             self.skip(len(self._data) - self._limit)
 
     def skip(self, n: int) -> None:
         """Drop n bytes that belong to no frame."""
-        del self._data[:n]
-        self._counters.skip(n)
+        if n > 0:
+            del self._data[:n]
+            self._counters.skip(n)
 
     def take(self, n: int) -> bytes:
         """Remove n understood bytes and return them."""
@@ -87,93 +85,130 @@ class ByteWindow:
         del self._data[:n]
         return taken
 
+    def skip_to(self, header: bytes) -> None:
+        """Skip to the first position where `header` may begin, keeping a header that is only half there."""
+        at = self._data.find(header)
+        if at < 0:
+            half = next((k for k in range(len(header) - 1, 0, -1) if self._data.endswith(header[:k])), 0)
+            at = len(self._data) - half
+        self.skip(at)
+
     def clear(self) -> None:
         """Forget everything, without counting it: the line was flushed."""
         self._data.clear()
 
 
-Judge = Callable[[Bytes], NDArray[np.bool_]]  # (M, length) candidate frames -> which of them are good
+@dataclass(frozen=True, slots=True)
+class Frames:
+    """Good frames in the order they came."""
+
+    data: Bytes  # (M, length)
+    behind: NDArray[np.int64]  # (M,) bytes of the same read that came after the frame: how long ago it arrived
+    gap: NDArray[np.int64]  # (M,) bytes skipped right before the frame: not 0 on a line that is not clean
+
+    def __len__(self) -> int:
+        return len(self.data)
 
 
-def fixed_frames(
-    window: ByteWindow, counters: Counters, header: bytes, length: int, judge: Judge
-) -> tuple[Bytes, NDArray[np.int64]]:
-    """Take all good frames of `length` bytes that start with `header`: (M, length) bytes, and (M,) bytes that followed each.
+class FixedFrames:
+    """Takes frames of one length and header out of a window; `judge` says which candidates are good."""
 
-    What follows a frame tells how long before the end of this read it arrived.
-    """
-    data = np.frombuffer(bytes(window.data), dtype=np.uint8)
-    n = len(data)
-    if n < length:
-        _skip_to_header(window, header)
-        return np.empty((0, length), np.uint8), np.empty(0, np.int64)
-    windows = np.lib.stride_tricks.sliding_window_view(data, length)
-    is_candidate = windows[:, 0] == header[0]
-    for i in range(1, len(header)):
-        is_candidate &= windows[:, i] == header[i]
-    candidates = np.flatnonzero(is_candidate)
-    good = candidates[judge(windows[candidates])] if len(candidates) else candidates
-    starts, end = chain(good, length)
-    n_bad = int(np.count_nonzero(_outside(candidates, starts, length)))
-    return _take(window, counters, windows, starts, end, n_bad, header, length)
+    MANY_FRAMES = 24  # from this many on numpy is faster than the loop (tests/bench/lidar_cpu.py)
+
+    def __init__(
+        self,
+        header: bytes,
+        length: int,
+        judge: Callable[[bytes], bool],
+        judge_many: Callable[[Bytes], NDArray[np.bool_]],  # (M, length) -> (M,)
+        header_mask: bytes | None = None,
+    ) -> None:
+        self.length = length
+        self._header, self._judge, self._judge_many = header, judge, judge_many
+        self._mask = header_mask  # for headers of which only some bits are fixed
+
+    def take(self, window: ByteWindow, counters: Counters) -> Frames:
+        """All good frames that are complete; what cannot begin a frame is skipped and counted."""
+        many = len(window) >= self.MANY_FRAMES * self.length
+        frames = self._take_many(window, counters) if many else self._take_few(window, counters)
+        window.trim()
+        return frames
+
+    def _take_few(self, window: ByteWindow, counters: Counters) -> Frames:
+        taken: list[bytes] = []
+        left: list[int] = []
+        gaps: list[int] = []
+        while True:
+            self._skip_to_header(window)
+            if len(window) < self.length:
+                break
+            frame = bytes(window.data[: self.length])
+            if self._judge(frame):
+                taken.append(window.take(self.length))
+                left.append(len(window))
+                gaps.append(counters.good())
+            else:
+                counters.bad_frames += 1
+                window.skip(1)
+        data = np.frombuffer(b"".join(taken), np.uint8).reshape(-1, self.length)
+        return Frames(data, np.array(left, np.int64), np.array(gaps, np.int64))
+
+    def _skip_to_header(self, window: ByteWindow) -> None:
+        if self._mask is None:
+            window.skip_to(self._header)
+            return
+        data, mask, header = window.data, self._mask, self._header
+        n = len(data)
+        for at in range(n):
+            if all(at + k >= n or data[at + k] & mask[k] == header[k] for k in range(len(header))):
+                window.skip(at)
+                return
+        window.skip(n)
+
+    def _take_many(self, window: ByteWindow, counters: Counters) -> Frames:
+        n, length = len(window), self.length
+        windows = np.lib.stride_tricks.sliding_window_view(np.frombuffer(bytes(window.data), np.uint8), length)
+        candidates = self._candidates(windows)
+        starts = chain(candidates[self._judge_many(windows[candidates])], length)
+        end = int(starts[-1]) + length if len(starts) else 0
+        gaps = np.diff(starts, prepend=-length) - length
+        if len(starts):
+            counters.skipped_bytes += int(gaps.sum())
+            gaps[0] += counters.gap_bytes
+            counters.gap_bytes = 0
+        counters.bad_frames += _count_outside(candidates, starts, length)
+        counters.resyncs += int(np.count_nonzero(gaps))
+        counters.frames += len(starts)
+        window.take(end)
+        window.skip(n - length + 1 - end)  # every position before had all its bytes and was judged
+        self._skip_to_header(window)
+        return Frames(windows[starts], n - (starts + length), gaps)
+
+    def _candidates(self, windows: Bytes) -> NDArray[np.int64]:
+        is_candidate = np.ones(len(windows), dtype=bool)
+        for i, value in enumerate(self._header):
+            column = windows[:, i] if self._mask is None else windows[:, i] & self._mask[i]
+            is_candidate &= column == value
+        return np.flatnonzero(is_candidate)
 
 
-def chain(good: NDArray[np.int64], length: int) -> tuple[NDArray[np.int64], int]:
+def chain(good: NDArray[np.int64], length: int) -> NDArray[np.int64]:
     """Walk over good positions as the byte-at-a-time search does: each frame begins at or after the end of the one before."""
-    if len(good) == 0:
-        return good, 0
-    if np.all(np.diff(good) >= length):
-        return good, int(good[-1]) + length
+    if len(good) < 2 or np.all(np.diff(good) >= length):
+        return good
     kept: list[int] = []
     end = 0
     for start in good.tolist():
         if start >= end:
             kept.append(start)
             end = start + length
-    return np.array(kept, dtype=np.int64), end
+    return np.array(kept, dtype=np.int64)
 
 
-def _outside(candidates: NDArray[np.int64], starts: NDArray[np.int64], length: int) -> NDArray[np.bool_]:
-    """Which candidate headers lie in no good frame: those were tried and found bad."""
+def _count_outside(candidates: NDArray[np.int64], starts: NDArray[np.int64], length: int) -> int:
+    """How many candidate headers lie in no good frame: those were tried and found bad."""
     if len(starts) == 0:
-        return np.ones(len(candidates), dtype=bool)
+        return len(candidates)
     before = np.searchsorted(starts, candidates, side="right") - 1
-    inside: NDArray[np.bool_] = (before >= 0) & (candidates - starts[np.maximum(before, 0)] < length)
-    return ~inside
-
-
-def _take(
-    window: ByteWindow,
-    counters: Counters,
-    windows: Bytes,
-    starts: NDArray[np.int64],
-    end: int,
-    n_bad: int,
-    header: bytes,
-    length: int,
-) -> tuple[Bytes, NDArray[np.int64]]:
-    n = len(window)
-    frames = windows[starts]
-    counters.bad_frames += n_bad
-    gaps = np.diff(starts, prepend=-length) - length if len(starts) else np.empty(0, np.int64)
-    counters.skipped_bytes += int(gaps.sum())
-    counters.resyncs += int(np.count_nonzero(gaps[1:])) + int(len(gaps) > 0 and (counters.is_skipping or gaps[0] > 0))
-    counters.frames += len(starts)
-    if len(starts):
-        counters.is_skipping = False
-    window.take(end)
-    judged_up_to = n - length + 1  # every position before this one had all its bytes and was judged
-    window.skip(max(0, judged_up_to - end))
-    _skip_to_header(window, header)
-    return frames, n - (starts + length)
-
-
-def _skip_to_header(window: ByteWindow, header: bytes) -> None:
-    """Skip to the first position where a header may begin, keeping a header that is only half there."""
-    data = window.data
-    for k in range(len(header), 0, -1):
-        at = data.find(header[:k]) if k == len(header) else (len(data) - k if data.endswith(header[:k]) else -1)
-        if at >= 0:
-            window.skip(at)
-            return
-    window.skip(len(data))
+    is_inside = (before >= 0) & (candidates - starts[np.maximum(before, 0)] < length)
+    return int(np.count_nonzero(~is_inside))

@@ -1,0 +1,80 @@
+"""Opens devices by URL: `open_lidar("ld06:/dev/ttyUSB0")`, `open_wheels("wheels:/dev/ttyACM0")`, then `start()` and `read()`.
+
+A URL that can never work raises `DeviceConfigError` here; afterwards a device never raises, see `supervisor.py`.  Sources
+that are no serial device (simulated worlds, recordings) register a scheme of their own with `register_scheme`.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping
+from typing import Protocol
+
+from hw.driver import Driver, Reading
+from hw.errors import DeviceConfigError
+from hw.lidars import LIDARS
+from hw.port import SerialPort
+from hw.supervisor import Device, DeviceHealth, DeviceState
+from hw.urls import DeviceUrl, parse_url
+from hw.wheel_driver import BASES
+
+__all__ = ["Device", "DeviceHealth", "DeviceState", "Source", "open_lidar", "open_wheels", "register_scheme", "schemes"]
+
+
+class Source(Protocol):
+    """What `open_lidar` and `open_wheels` return; `Device` is the usual one."""
+
+    def start(self) -> Source: ...
+
+    def stop(self) -> None: ...
+
+    def read(self, timeout_s: float) -> Reading | None: ...
+
+    def health(self) -> DeviceHealth: ...
+
+
+Factory = Callable[[DeviceUrl, str], Source]  # (url, "lidar" | "wheels")
+
+_factories: dict[str, Factory] = {}
+_on_demand = {"sim": "hw.sim.sim_port", "log": "hw.carmen", "replay": "hw.recorder"}  # modules that register their scheme
+
+
+def register_scheme(scheme: str, factory: Factory) -> None:
+    """Make `scheme:...` a device URL."""
+    _factories[scheme] = factory
+
+
+def open_lidar(url: str) -> Source:
+    """A LIDAR by its URL; not yet started."""
+    return _open(url, "lidar", LIDARS)
+
+
+def open_wheels(url: str) -> Source:
+    """A wheel base by its URL; not yet started."""
+    return _open(url, "wheels", BASES)
+
+
+def schemes(kind: str) -> list[str]:
+    """The URL schemes of serial devices, "lidar" or "wheels"."""
+    return sorted(LIDARS if kind == "lidar" else BASES)
+
+
+def _open(text: str, kind: str, drivers: Mapping[str, Callable[[DeviceUrl], Driver]]) -> Source:
+    url = parse_url(text)
+    if url.scheme in drivers:
+        return _serial_device(url, drivers[url.scheme](url))
+    if url.scheme not in _factories and url.scheme in _on_demand:
+        importlib.import_module(_on_demand[url.scheme])
+    if url.scheme not in _factories:
+        known = ", ".join(sorted([*drivers, *_factories.keys() | _on_demand.keys()]))
+        other = "open it as the other kind of device" if url.scheme in (*LIDARS, *BASES) else f"there are {known}"
+        raise DeviceConfigError(f"{text}: '{url.scheme}' is no kind of {kind}; {other}")
+    return _factories[url.scheme](url, kind)
+
+
+def _serial_device(url: DeviceUrl, driver: Driver) -> Device:
+    if not url.path:
+        raise DeviceConfigError(f"{url.text}: which port? for example {url.scheme}:/dev/ttyUSB0")
+    if "baud" in url.options:
+        driver.bauds = (url.integer("baud", 0, 300, 4_000_000),)
+    return Device(url.text, driver, lambda baud, dtr: SerialPort(url.path, baud, dtr), url.path)

@@ -1,0 +1,101 @@
+"""What LIDARs with a turning head share: frames are held until a revolution ends, then decoded together.
+
+Decoding a whole revolution in numpy costs a tenth of decoding each frame as it comes, and a scan cannot be handed on
+earlier anyway.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hw.driver import DriverBase, Reading
+from hw.framing import Bytes, ByteWindow, FixedFrames, Frames
+from hw.scan_assembler import Beams, ScanAssembler
+
+HOLD_AT_MOST = 256  # frames: bounds delay and memory when no revolution ends
+
+
+class SpinningLidar(DriverBase):
+    """A `Driver` but for the protocol: `_find`, `_is_turn` and `_beams` are its own."""
+
+    def __init__(self, range_min_m: float, range_max_m: float) -> None:
+        super().__init__()
+        self._window = ByteWindow(self.counters)
+        self._assembler = ScanAssembler(range_min_m, range_max_m)
+        self._held: list[Frames] = []
+        self._held_arrivals_s: list[NDArray[np.float64]] = []
+
+    @property
+    def coverage(self) -> float:
+        """Of the last scan."""
+        return self._assembler.coverage
+
+    @property
+    def range_min_m(self) -> float:
+        """Nearest range that is believed."""
+        return self._assembler.range_min_m
+
+    @property
+    def range_max_m(self) -> float:
+        """Farthest range that is believed."""
+        return self._assembler.range_max_m
+
+    def limit(self, range_min_m: float, range_max_m: float) -> None:
+        """Believe only ranges within these limits."""
+        self._assembler.range_min_m, self._assembler.range_max_m = range_min_m, range_max_m
+
+    def restart(self) -> None:
+        """See `Driver.restart`."""
+        self._window.clear()
+        self._assembler.restart()
+        self._drop_held()
+
+    def _drop_held(self) -> None:
+        self._held.clear()
+        self._held_arrivals_s.clear()
+
+    def _hold(self, frames: Frames, now_s: float, is_turn: bool) -> list[Reading]:
+        """Keep these frames; decode what is kept when a revolution ends."""
+        if len(frames):
+            self._held.append(frames)
+            self._held_arrivals_s.append(now_s - frames.behind.astype(np.float64) * (10.0 / self.baud))
+        if not self._held or not (is_turn or sum(map(len, self._held)) >= HOLD_AT_MOST):
+            return []
+        data = np.concatenate([held.data for held in self._held])
+        gaps = np.concatenate([held.gap for held in self._held])
+        arrivals_s = np.concatenate(self._held_arrivals_s)
+        self._drop_held()
+        beams = self._beams(data, gaps, arrivals_s)
+        scans = self._assembler.add(beams)
+        self.period_s = self._assembler.period_s
+        return list(scans)
+
+    def _beams(self, frames: Bytes, gaps: NDArray[np.int64], arrivals_s: NDArray[np.float64]) -> Beams:
+        raise NotImplementedError
+
+
+class FixedFrameLidar(SpinningLidar):
+    """A spinning LIDAR that sends frames of one kind only."""
+
+    frames: FixedFrames
+
+    def feed(self, data: bytes, now_s: float) -> list[Reading]:
+        """Scans that these bytes complete."""
+        self._window.push(data)
+        frames = self.frames.take(self._window, self.counters)
+        return self._hold(frames, now_s, len(frames) > 0 and self._is_turn(frames))
+
+    def _is_turn(self, frames: Frames) -> bool:
+        """Does a revolution end in these frames?  A wrong yes costs a little time, nothing else."""
+        raise NotImplementedError
+
+
+def carried(dirty: NDArray[np.bool_], kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Dirt of frames that are dropped moves on to the next frame kept: (M,) of all to (K,) of the kept."""
+    if kept.all():
+        return dirty
+    following: NDArray[np.int64] = np.cumsum(kept) - kept  # index among the kept of the frame at or after each
+    moved = np.zeros(int(kept.sum()) + 1, bool)
+    np.logical_or.at(moved, following, dirty)
+    return moved[:-1]

@@ -1,0 +1,434 @@
+"""A device that is kept alive: one thread opens its port, wakes it, feeds its driver, and starts again whatever happens.
+
+    DISCONNECTED -> PROBING (which rate, who is it) -> STARTING (motor, first reading) -> RUNNING <-> DEGRADED
+         ^                                                                                   |
+         +------------- back-off 50 ms, doubled to 2 s, for ever <---- pulled, silent -------+
+
+A stall (no reading for three periods, at least 0.3 s) restarts the stream, the second in a row reopens the port.  A device
+fault never leaves `read()` as an exception: it is None, and `health()` says why.
+"""
+
+from __future__ import annotations
+
+import random
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Any
+
+from hw.driver import Ask, Drain, Driver, Pause, Reading, Script, Send, SetBaud, SetLines
+from hw.errors import DeviceAbsent, DeviceError, DeviceGarbled, DeviceSilent
+from hw.framing import Counters
+from hw.port import Port
+from hw.readings import LaserScan, Odometry
+
+FIRST_BACK_OFF_S, LAST_BACK_OFF_S = 0.05, 2.0  # a replugged cable is back within a second; a missing one costs nothing
+READ_WAIT_S = 0.05
+MIN_STALL_S, STALL_PERIODS = 0.3, 3.0  # HARDWARE.md: noticed within half a second at 10 Hz
+PROBE_S = 0.6  # how long a rate is listened to before the next one is tried
+FIRST_READING_S = 5.0  # a motor needs 1-2 s to spin up
+SCAN_SLOTS, ODOMETRY_SLOTS = 2, 512  # newest wins: an old scan is worth nothing, old odometry is cheap
+
+
+class DeviceState(Enum):
+    """Where a device stands."""
+
+    DISCONNECTED = "disconnected"
+    PROBING = "probing"
+    STARTING = "starting"
+    RUNNING = "running"
+    DEGRADED = "degraded"
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceHealth:
+    """All there is to say about a device, for `status`, `doctor` and the log."""
+
+    url: str
+    state: DeviceState
+    port: str = ""
+    baud: int = 0
+    model: str = ""
+    serial: str = ""
+    firmware: str = ""
+    uptime_s: float = 0.0  # since the stream last started
+    age_s: float = float("inf")  # of the newest reading
+    rate_hz: float = 0.0
+    points: int = 0  # of the newest scan
+    coverage: float = 0.0  # of the newest scan, 0..1
+    bytes_per_s: float = 0.0
+    readings: int = 0
+    bad_frames: int = 0
+    skipped_bytes: int = 0
+    rejected: int = 0
+    resyncs: int = 0
+    stalls: int = 0
+    reconnects: int = 0
+    dropped: int = 0  # readings nobody fetched in time
+    last_error: str = ""  # what went wrong last, and what to try
+
+
+OpenPort = Callable[[int, bool | None], Port]  # (baud, level of DTR while opening)
+
+
+class Device:
+    """One supervised device.  `read` may be called from any one thread; `health` from any."""
+
+    def __init__(
+        self,
+        url: str,
+        driver: Driver,
+        open_port: OpenPort,
+        port_name: str = "",
+        rng: random.Random | None = None,
+        tap: Callable[[float, bytes], None] | None = None,
+    ) -> None:
+        self._url, self._driver, self._open_port = url, driver, open_port
+        self._rng = rng or random.Random()
+        self._tap = tap  # sees every byte that comes, with its time: the recorder
+        self._readings: deque[Reading] = deque()
+        self._arrived = threading.Condition()
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._port: Port | None = None
+        self._health = DeviceHealth(url, DeviceState.DISCONNECTED, port_name)
+        self._running_since_s = self._last_reading_s = 0.0
+        self._stamps: deque[float] = deque(maxlen=20)
+        self._rates = _RateMeter()
+
+    def start(self) -> Device:
+        """Begin; returns at once, the device comes up in the background."""
+        if self._thread is None:
+            self._stopping.clear()
+            self._thread = threading.Thread(target=self._run, name=f"device {self._url}", daemon=True)
+            self._thread.start()
+        return self
+
+    def stop(self) -> None:
+        """Stop the device (motor too) and close its port; returns within about a second."""
+        self._stopping.set()
+        port = self._port
+        if port is not None:
+            port.wake()
+        if self._thread is not None:
+            self._thread.join(timeout=3.0)
+            self._thread = None
+        with self._arrived:
+            self._arrived.notify_all()
+
+    def __enter__(self) -> Device:
+        return self.start()
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def read(self, timeout_s: float) -> Reading | None:
+        """The oldest reading not yet fetched, waiting up to `timeout_s`; None when there is none."""
+        with self._arrived:
+            self._arrived.wait_for(lambda: bool(self._readings) or self._stopping.is_set(), timeout_s)
+            return self._readings.popleft() if self._readings else None
+
+    def health(self) -> DeviceHealth:
+        """How the device is doing now."""
+        now_s = time.monotonic()
+        with self._arrived:
+            health, stamps = self._health, list(self._stamps)
+            counters, identity = self._driver.counters, self._driver.identity
+        is_up = health.state in (DeviceState.RUNNING, DeviceState.DEGRADED)
+        rate_hz = (len(stamps) - 1) / (stamps[-1] - stamps[0]) if is_up and len(stamps) > 1 and stamps[-1] > stamps[0] else 0.0
+        return replace(
+            health,
+            model=identity.model,
+            serial=identity.serial,
+            firmware=identity.firmware,
+            uptime_s=now_s - self._running_since_s if is_up else 0.0,
+            age_s=now_s - self._last_reading_s if self._last_reading_s else float("inf"),
+            rate_hz=rate_hz,
+            bytes_per_s=self._rates.bytes_per_s(now_s),
+            bad_frames=counters.bad_frames,
+            skipped_bytes=counters.skipped_bytes,
+            rejected=counters.rejected,
+            resyncs=counters.resyncs,
+        )
+
+    def _run(self) -> None:
+        """Open, run, fail, wait, again; until stopped."""
+        back_off_s = FIRST_BACK_OFF_S
+        while not self._stopping.is_set():
+            before = self._health.readings
+            try:
+                self._session()
+            except DeviceError as error:
+                self._note(state=DeviceState.DISCONNECTED, last_error=str(error))
+            except Exception as error:  # a bug of ours must not silence a robot's eyes
+                self._note(
+                    state=DeviceState.DISCONNECTED, last_error=f"{self._url}: internal error {error!r}; please report this"
+                )
+            finally:
+                self._close()
+            if self._health.readings > before:
+                back_off_s = FIRST_BACK_OFF_S
+            self._stopping.wait(back_off_s * self._rng.uniform(0.8, 1.2))
+            back_off_s = min(2 * back_off_s, LAST_BACK_OFF_S)
+            self._note(reconnects=self._health.reconnects + (not self._stopping.is_set()))
+        self._note(state=DeviceState.DISCONNECTED)
+
+    def _session(self) -> None:
+        """From opening the port to losing the device; returns only when stopped, else raises."""
+        driver = self._driver
+        self._port = port = self._open_port(driver.bauds[0], driver.open_dtr)
+        try:
+            self._bring_up(port)
+            self._stream(port)
+        finally:
+            if not self._is_gone:
+                self._quietly(driver.stop())
+
+    def _bring_up(self, port: Port) -> None:
+        """Try each rate until the device answers its start script and sends a first good frame."""
+        problems: list[DeviceError] = []
+        self._is_gone = False
+        for baud in self._driver.bauds:
+            self._note(state=DeviceState.PROBING, baud=baud)
+            self._set_baud(baud)
+            port.flush_input()
+            self._driver.restart()
+            try:
+                self._perform(self._driver.start())
+                self._first_frame()
+            except (DeviceSilent, DeviceGarbled) as error:
+                problems.append(error)
+                continue
+            return
+        if problems:
+            garbled = [p for p in problems if isinstance(p, DeviceGarbled)]
+            raise (garbled or problems)[0]
+
+    def _first_frame(self) -> None:
+        """Wait for a first good frame at this rate; say what was seen instead."""
+        counters = self._driver.counters
+        frames, seen = counters.frames, counters.bytes_in
+        begin_s = time.monotonic()
+        deadline_s = begin_s + (PROBE_S if len(self._driver.bauds) > 1 else FIRST_READING_S)
+        self._note(state=DeviceState.STARTING)
+        while counters.frames == frames:
+            if self._stopping.is_set():
+                return
+            now_s = time.monotonic()
+            n = counters.bytes_in - seen
+            if now_s > deadline_s and (n == 0 or now_s > begin_s + FIRST_READING_S or n > 4096):
+                self._raise_no_frame(n)
+            self._pump(READ_WAIT_S)
+
+    def _raise_no_frame(self, n_bytes: int) -> None:
+        rates = "/".join(map(str, self._driver.bauds))
+        if n_bytes == 0:
+            raise DeviceSilent(f"{self._url}: nothing comes at {self._health.baud} baud; is it powered, and does the motor turn?")
+        raise DeviceGarbled(
+            f"{self._url}: {n_bytes} bytes, no valid frame; is the baud rate {rates}, and is this really that device?"
+        )
+
+    def _stream(self, port: Port) -> None:
+        """Feed the driver until stopped; restart a stalled stream once, then give up the session."""
+        self._running_since_s = self._last_reading_s = time.monotonic()
+        has_run, restarts, next_poll_s = False, 0, 0.0
+        judge = _StreamJudge(self._driver.counters)
+        while not self._stopping.is_set():
+            now_s = time.monotonic()
+            if self._driver.poll_period_s is not None and now_s >= next_poll_s:
+                port.write(self._driver.poll())
+                next_poll_s = now_s + self._driver.poll_period_s
+            wait_s = READ_WAIT_S if self._driver.poll_period_s is None else min(READ_WAIT_S, self._driver.poll_period_s)
+            n = self._pump(wait_s)
+            now_s = time.monotonic()
+            if n:
+                has_run, restarts = True, 0
+                self._note(
+                    state=judge.state(now_s, self._health.coverage), last_error=judge.error(self._url) or self._health.last_error
+                )
+                continue
+            limit_s = self._stall_limit_s() if has_run else FIRST_READING_S
+            if now_s - self._last_reading_s > limit_s:
+                self._stalled(restarts)
+                restarts += 1
+                self._last_reading_s = now_s
+
+    def _stall_limit_s(self) -> float:
+        return max(MIN_STALL_S, STALL_PERIODS * self._driver.period_s)
+
+    def _stalled(self, restarts: int) -> None:
+        message = f"{self._url}: no reading for {self._stall_limit_s():.1f} s; is the motor blocked, or the cable loose?"
+        self._note(stalls=self._health.stalls + 1, state=DeviceState.STARTING, last_error=message)
+        if restarts > 0:
+            raise DeviceSilent(message)
+        self._driver.restart()
+        self._perform(self._driver.start())
+
+    def _perform(self, script: Script) -> None:
+        """Carry out a driver's script, step by step."""
+        answer: Any = None
+        while not self._stopping.is_set():
+            try:
+                step = script.send(answer)
+            except StopIteration:
+                return
+            answer = None
+            assert self._port is not None
+            if isinstance(step, Send):
+                self._port.write(step.data)
+            elif isinstance(step, Ask):
+                answer = self._ask(step)
+            elif isinstance(step, Drain):
+                answer = self._drain(step)
+            elif isinstance(step, Pause):
+                self._pump_for(step.seconds)
+            elif isinstance(step, SetLines):
+                self._port.set_lines(step.dtr, step.rts)
+            elif isinstance(step, SetBaud):
+                self._set_baud(step.baud)
+
+    def _ask(self, step: Ask) -> object:
+        assert self._port is not None
+        self._port.write(step.data)
+        deadline_s = time.monotonic() + step.timeout_s
+        while (answer := step.until()) is None and not self._stopping.is_set():
+            left_s = deadline_s - time.monotonic()
+            if left_s <= 0:
+                return None
+            self._pump(min(left_s, READ_WAIT_S))
+        return answer
+
+    def _drain(self, step: Drain) -> bool:
+        assert self._port is not None
+        deadline_s = time.monotonic() + step.max_s
+        while time.monotonic() < deadline_s and not self._stopping.is_set():
+            if not self._port.read(step.quiet_s):
+                return True
+        return False
+
+    def _pump_for(self, seconds: float) -> None:
+        deadline_s = time.monotonic() + seconds
+        while (left_s := deadline_s - time.monotonic()) > 0 and not self._stopping.is_set():
+            self._pump(min(left_s, READ_WAIT_S))
+
+    def _pump(self, wait_s: float) -> int:
+        """Move what has come to the driver and its readings to the reader; how many readings there were."""
+        assert self._port is not None
+        try:
+            data = self._port.read(wait_s)
+        except DeviceAbsent:
+            self._is_gone = True
+            raise
+        if not data:
+            return 0
+        now_s = time.monotonic()
+        if self._tap is not None:
+            self._tap(now_s, data)
+        self._rates.add(now_s, len(data))
+        readings = self._driver.feed(data, now_s)
+        for reading in readings:
+            self._hand_on(reading, now_s)
+        return len(readings)
+
+    def _hand_on(self, reading: Reading, now_s: float) -> None:
+        slots = SCAN_SLOTS if isinstance(reading, LaserScan) else ODOMETRY_SLOTS
+        dropped = 0
+        with self._arrived:
+            while len(self._readings) >= slots:
+                oldest = self._readings.popleft()
+                dropped += 1
+                if isinstance(oldest, Odometry) and oldest.is_discontinuity:
+                    self._keep_discontinuity(reading)
+            self._readings.append(reading)
+            self._stamps.append(now_s)
+            self._last_reading_s = now_s
+            self._health = replace(self._health, readings=self._health.readings + 1, dropped=self._health.dropped + dropped)
+            if isinstance(reading, LaserScan):
+                self._health = replace(
+                    self._health, points=len(reading.ranges_m), coverage=getattr(self._driver, "coverage", 1.0)
+                )
+            self._arrived.notify_all()
+
+    def _keep_discontinuity(self, newest: Reading) -> None:
+        """A discontinuity that nobody fetched moves on to the next sample: it must not be lost."""
+        if self._readings and isinstance(self._readings[0], Odometry):
+            self._readings[0] = replace(self._readings[0], is_discontinuity=True)
+
+    def _set_baud(self, baud: int) -> None:
+        assert self._port is not None
+        self._port.set_baud(baud)
+        self._driver.set_baud(baud)
+        self._note(baud=baud)
+
+    def _quietly(self, script: Script) -> None:
+        """Send what stops the device, without listening: used when leaving, so it must not take long or fail."""
+        try:
+            for step in script:
+                if self._port is None:
+                    return
+                if isinstance(step, Send | Ask):
+                    self._port.write(step.data)
+                elif isinstance(step, SetLines):
+                    self._port.set_lines(step.dtr, step.rts)
+                elif isinstance(step, Pause):
+                    time.sleep(min(step.seconds, 0.05))
+        except DeviceError:
+            return
+
+    def _close(self) -> None:
+        port, self._port = self._port, None
+        if port is not None:
+            port.close()
+
+    def _note(self, **facts: Any) -> None:
+        with self._arrived:
+            self._health = replace(self._health, **facts)
+
+    _is_gone = False
+
+
+class _RateMeter:
+    """Bytes a second over the last two seconds."""
+
+    def __init__(self) -> None:
+        self._slots: deque[tuple[float, int]] = deque(maxlen=400)
+        self._lock = threading.Lock()
+
+    def add(self, now_s: float, n: int) -> None:
+        with self._lock:
+            self._slots.append((now_s, n))
+
+    def bytes_per_s(self, now_s: float) -> float:
+        with self._lock:
+            recent = [(s, n) for s, n in self._slots if now_s - s < 2.0]
+        if not recent:
+            return 0.0
+        return sum(n for _, n in recent) / max(0.1, now_s - recent[0][0])
+
+
+class _StreamJudge:
+    """RUNNING or DEGRADED: more than 1 % of the frames bad within a second, or a scan with less than 95 % of its circle."""
+
+    def __init__(self, counters: Counters) -> None:
+        self._counters = counters
+        self._since_s = 0.0
+        self._frames = self._bad = 0
+        self._bad_share = 0.0
+
+    def state(self, now_s: float, coverage: float) -> DeviceState:
+        if now_s - self._since_s > 1.0:
+            c = self._counters
+            bad, frames = c.bad_frames + c.rejected, c.frames
+            new_bad, new_frames = bad - self._bad, frames - self._frames
+            self._bad_share = new_bad / max(1, new_bad + new_frames) if self._since_s else 0.0
+            self._since_s, self._bad, self._frames = now_s, bad, frames
+        is_fine = self._bad_share <= 0.01 and (coverage == 0.0 or coverage >= 0.95)
+        return DeviceState.RUNNING if is_fine else DeviceState.DEGRADED
+
+    def error(self, url: str) -> str:
+        if self._bad_share <= 0.01:
+            return ""
+        return f"{url}: {self._bad_share:.0%} of the frames are damaged; a shorter cable, or another power supply?"
