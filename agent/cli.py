@@ -1,0 +1,138 @@
+"""`mapquilt COMMAND ...`: one table of commands, each in a module of its own that is imported only when asked for.
+
+A command module offers `EXAMPLES` (text), `add_arguments(parser)` and `run(args) -> int`.  Data goes to stdout, talk to stderr.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import importlib
+import os
+import sys
+import traceback
+from types import ModuleType
+
+from agent import __version__
+from agent.exits import BUG, EXIT_CODES, INTERRUPTED, OK, USAGE, CommandError
+
+COMMANDS: dict[str, tuple[str, str]] = {  # name: (module, what it does)
+    "run": ("agent.commands.run", "be a robot: map, meet the others, merge"),
+    "demo": ("agent.commands.demo", "a fleet of simulated robots on this machine, and a page to look at it"),
+    "watch": ("agent.commands.watch", "the live page of a fleet, on a laptop"),
+    "status": ("agent.commands.status", "what the running robot sees, knows and merged"),
+    "pause": ("agent.commands.control", "the running robot stops mapping; its map stays"),
+    "resume": ("agent.commands.control", "the running robot goes on mapping"),
+    "reset": ("agent.commands.control", "the running robot starts an empty map"),
+    "unmerge": ("agent.commands.control", "the running robot takes a merge back"),
+    "save": ("agent.commands.control", "the running robot writes its state now"),
+    "merge": ("agent.commands.merge", "lay map files over one another: nav2 maps in and out"),
+    "map": ("agent.commands.map", "a recording (CARMEN log, rosbag2, MCAP) into a map"),
+    "localize": ("agent.commands.localize", "find a small map in a big one"),
+    "features": ("agent.commands.features", "the lines, circles, arcs and curves of a map"),
+    "export": ("agent.commands.export", "a robot's saved map as nav2, PNG, TUM or MCAP files"),
+    "report": ("agent.commands.report", "a run's records as one HTML page"),
+    "devices": ("agent.commands.devices", "serial ports, and which sensor answers on each"),
+    "scan": ("agent.commands.scan", "live figures of a LIDAR"),
+    "record": ("agent.commands.record", "keep a device's raw bytes, to replay later"),
+    "sim": ("agent.commands.sim", "serve a simulated sensor on a pty"),
+    "doctor": ("agent.commands.doctor", "what is wrong on this machine, and the command that mends it"),
+    "config": ("agent.commands.config", "the settings in force, and where each came from"),
+    "fleet": ("agent.commands.fleet", "keys and certificates of a fleet"),
+    "router": ("agent.commands.router", "a Zenoh router for larger fleets"),
+    "completion": ("agent.commands.completion", "TAB completion for bash, zsh and fish, and a man page"),
+}
+
+EXAMPLES = """\
+  mapquilt demo                                                    three simulated robots, one map
+  mapquilt run --lidar rplidar:/dev/ttyUSB0 --wheels wheels:/dev/ttyACM0
+  mapquilt merge a.yaml b.yaml -o both                             two nav2 maps into one
+  mapquilt map recording.clf -o out                                a CARMEN log into a map
+"""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs one command; never raises, the return value is the exit code."""
+    argv = sys.argv[1:] if argv is None else argv
+    try:
+        return _dispatch(argv)
+    except CommandError as error:
+        complain(str(error))
+        return error.code
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except BrokenPipeError:  # `mapquilt features map.yaml | head`: the reader has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return OK
+    except Exception as error:
+        traceback.print_exc()
+        complain(f"this is a bug of ours ({type(error).__name__}: {error}); please report it with the lines above")
+        return BUG
+
+
+def complain(message: str) -> None:
+    print(f"mapquilt: {message}", file=sys.stderr)
+
+
+def _dispatch(argv: list[str]) -> int:
+    split = next((i for i, word in enumerate(argv) if not word.startswith("-")), len(argv))
+    if split == len(argv):
+        return _without_command(argv)
+    name = argv[split]
+    if name == "help":
+        return _dispatch([*argv[split + 1 : split + 2], "--help"])
+    if name not in COMMANDS:
+        near = difflib.get_close_matches(name, COMMANDS, 1)
+        hint = f"; did you mean '{near[0]}'?" if near else "; mapquilt --help lists them"
+        raise CommandError(f"unknown command '{name}'{hint}", USAGE)
+    parser = command_parser(name)
+    args = parser.parse_args([*argv[:split], *argv[split + 1 :]])
+    if args.no_color:
+        os.environ["NO_COLOR"] = "1"
+    return int(load_command(name).run(args))
+
+
+def load_command(name: str) -> ModuleType:
+    """The module of a command, imported now."""
+    return importlib.import_module(COMMANDS[name][0])
+
+
+def command_parser(name: str) -> argparse.ArgumentParser:
+    """The complete parser of one command; `args.command` is its name."""
+    module, summary = load_command(name), COMMANDS[name][1]
+    examples = f"\n\nexamples:\n{module.EXAMPLES.rstrip()}" if module.EXAMPLES else ""
+    parser = _parser(f"mapquilt {name}", f"{summary[0].upper()}{summary[1:]}.{examples}")
+    parser.set_defaults(command=name)
+    module.add_arguments(parser)
+    return parser
+
+
+def top_parser() -> argparse.ArgumentParser:
+    """What `mapquilt --help` shows, without importing any command."""
+    listed = "\n".join(f"  {name:<11} {summary}" for name, (_, summary) in COMMANDS.items())
+    parser = _parser(
+        "mapquilt",
+        "Robots that explore apart find out by themselves how their maps fit together, and end up with one map.\n\n"
+        f"examples:\n{EXAMPLES}\ncommands:\n{listed}\n\nmapquilt COMMAND --help tells more about one of them.",
+    )
+    parser.usage = "mapquilt COMMAND ..."
+    parser.epilog = f"exit codes:\n{EXIT_CODES}"
+    parser.add_argument("--version", action="version", version=f"mapquilt {__version__}")
+    return parser
+
+
+def _without_command(argv: list[str]) -> int:
+    parser = top_parser()
+    parser.parse_args(argv)
+    parser.print_help(sys.stderr)
+    return USAGE
+
+
+def _parser(prog: str, description: str) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog, description=description, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
+    parser.add_argument("-q", "--quiet", action="store_true", help="say only what went wrong")
+    parser.add_argument("-v", "--verbose", action="store_true", help="say more")
+    parser.add_argument("--no-color", action="store_true", help="plain text (also: NO_COLOR=1)")
+    return parser
