@@ -150,8 +150,9 @@ class Evidence:
         for version in (self.map_a, self.map_b):
             digest.update(struct.pack("<QQ", version.frame, version.revision) + version.digest)
         T = self.T_a_b
-        digest.update(struct.pack("<9d", T.x_m, T.y_m, T.theta_rad, *self.covariance))
-        digest.update(struct.pack("<QQdd", self.agree, self.disagree, self.overlap_m2, self.score))
+        digest.update(struct.pack("<3d", T.x_m + 0.0, T.y_m + 0.0, T.theta_rad + 0.0))  # -0.0 is 0.0
+        digest.update(struct.pack("<6d", *self.covariance))
+        digest.update(struct.pack("<QQdd", self.agree, self.disagree, self.overlap_m2 + 0.0, self.score + 0.0))
         return digest.digest()[:8]
 
     def other(self, robot: str) -> str:

@@ -236,7 +236,8 @@ def _lattice(grid: OccupancyGrid, previous: TileMap | None) -> tuple[SE2, TileKe
 
 def _digest(tile_map: TileMap) -> bytes:
     anchor = tile_map.anchor
-    digest = hashlib.sha256(struct.pack("<4d", tile_map.resolution_m, anchor.x_m, anchor.y_m, anchor.theta_rad))
+    place = (tile_map.resolution_m, anchor.x_m + 0.0, anchor.y_m + 0.0, anchor.theta_rad + 0.0)  # -0.0 is 0.0
+    digest = hashlib.sha256(struct.pack("<4d", *place))
     for key in sorted(tile_map.tiles):
         digest.update(struct.pack("<2i", *key))
         digest.update(tile_map.tiles[key])
