@@ -9,8 +9,8 @@ import queue
 import time
 from collections.abc import Callable
 
+from agent.mapping.estimate import MapEstimate
 from agent.mapping.mapper import Mapper
-from agent.mapping.types import MapEstimate
 from agent.runtime.latest import Latest
 from agent.runtime.sensing import Readings
 

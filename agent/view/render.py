@@ -19,7 +19,16 @@ Image = NDArray[np.uint8]  # (H, W, 3) BGR or (H, W, 4) BGRA
 UNKNOWN_BGR = (205, 205, 205)  # the grey of map_server pictures
 FREE_BGR = (254, 254, 254)
 OCCUPIED_BGR = (30, 24, 20)
-ROBOT_COLOURS_BGR = ((180, 90, 0), (30, 110, 220), (70, 150, 40), (150, 60, 150), (40, 40, 200), (150, 140, 0), (90, 90, 90), (60, 160, 220))
+ROBOT_COLOURS_BGR = (
+    (180, 90, 0),
+    (30, 110, 220),
+    (70, 150, 40),
+    (150, 60, 150),
+    (40, 40, 200),
+    (150, 140, 0),
+    (90, 90, 90),
+    (60, 160, 220),
+)
 MAX_PIXELS = 4_000_000
 
 
@@ -38,7 +47,9 @@ def grid_png(grid: OccupancyGrid) -> bytes:
     """One pixel a cell: black is unknown, grey 1 is free, grey 2 is occupied; the page gives them their colours."""
     table = np.zeros(256, np.uint8)
     table[FREE], table[OCCUPIED] = 128, 255
-    ok, data = cv2.imencode(".png", np.ascontiguousarray(table[grid.cells.astype(np.uint8)][::-1]), [cv2.IMWRITE_PNG_COMPRESSION, 4])
+    ok, data = cv2.imencode(
+        ".png", np.ascontiguousarray(table[grid.cells.astype(np.uint8)][::-1]), [cv2.IMWRITE_PNG_COMPRESSION, 4]
+    )
     assert ok
     return bytes(data.tobytes())
 

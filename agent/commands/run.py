@@ -1,0 +1,181 @@
+"""`mapquilt run`: be a robot, until told to stop."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import ctypes
+import faulthandler
+import json
+import logging
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import cv2
+
+from agent.config import Config, control_socket, state_dir
+from agent.config_flags import add_config_arguments, load_from
+from agent.exits import BAD_INPUT, ENVIRONMENT, OK, PEER, USAGE, CommandError
+from agent.runtime.control import ControlError
+from agent.runtime.exchange import ExchangeError
+from agent.runtime.log_setup import set_up_logging
+from agent.runtime.network import NetworkConfigError
+from agent.runtime.node import Node
+from agent.view.server import ViewServer
+from hw.errors import DeviceConfigError
+
+log = logging.getLogger(__name__)
+
+EXAMPLES = """\
+  mapquilt run --lidar rplidar:/dev/ttyUSB0 --wheels wheels:/dev/ttyACM0
+  mapquilt run --config robot.toml --id robot-1 --profile lan --security shared
+  mapquilt run --id r1 --lidar sim:office?seed=3 --no-view
+"""
+
+EXIT_WATCHDOG_S = 12.0  # Zenoh may take 10 s to close a dead link; after that the process goes anyway
+PORTS_TRIED = 20
+PR_SET_PDEATHSIG = 1
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_config_arguments(parser)
+    parser.add_argument("--ready-json", action="store_true", help="print one JSON line with addresses once the robot is up")
+    parser.add_argument("--no-state", action="store_true", help="keep nothing on disk")
+    parser.add_argument("--die-with-parent", action="store_true", help="stop when the process that started this one is gone")
+
+
+def run(args: argparse.Namespace) -> int:
+    config = load_from(args).config
+    if args.quiet or args.verbose:
+        config = replace(config, log=replace(config.log, level="warning" if args.quiet else "debug"))
+    set_up_logging(config.log.level, config.robot.id)
+    if args.die_with_parent:
+        die_with_parent()
+    cv2.setNumThreads(1)  # one core is for mapping; OpenCV's own threads only get in its way
+    stopping = StopSignals()
+    node = make_node(with_devices(config), keeps_state=not args.no_state)
+    stopping.then(node.stopping.set)
+    with exit_watchdog(node.stopping), running(node), contextlib.ExitStack() as stack:
+        page = serve_page(node, config) if config.view.enabled else None
+        if page is not None:
+            stack.callback(page.close)
+        if args.ready_json:
+            print(json.dumps(ready_line(node, page)), flush=True)
+        log.info("up fleet=%s profile=%s security=%s", config.fleet.name, config.fleet.profile, config.fleet.security)
+        node.run()
+        log.info("stopping")
+    return OK
+
+
+def with_devices(config: Config) -> Config:
+    """A simulator or a recording is both devices at once."""
+    if not config.lidar.url:
+        raise CommandError("no LIDAR: give --lidar rplidar:/dev/ttyUSB0 (mapquilt devices lists what is plugged in)", USAGE)
+    if not config.wheels.url and config.lidar.url.startswith(("sim:", "log:")):
+        return replace(config, wheels=replace(config.wheels, url=config.lidar.url))
+    return config
+
+
+def make_node(config: Config, *, keeps_state: bool) -> Node:
+    folder = state_dir(config, os.environ) if keeps_state else None
+    socket = control_socket(config.robot.id, os.environ) if keeps_state else None
+    try:
+        return Node(config, folder, socket)
+    except (DeviceConfigError, NetworkConfigError) as error:
+        raise CommandError(str(error), USAGE) from error
+
+
+@contextlib.contextmanager
+def running(node: Node) -> Any:
+    """The node, up; what keeps it from coming up is one sentence and an exit code."""
+    try:
+        node.__enter__()
+    except ExchangeError as error:
+        raise CommandError(str(error), PEER) from error
+    except ControlError as error:
+        raise CommandError(str(error), ENVIRONMENT) from error
+    except DeviceConfigError as error:
+        raise CommandError(str(error), BAD_INPUT) from error
+    try:
+        yield
+    finally:
+        node.stop()
+
+
+def serve_page(node: Node, config: Config) -> ViewServer | None:
+    """The page on the wished port, or on the next free one; a robot without a page is still a robot."""
+    wished = config.view.port
+    for port in range(wished, wished + PORTS_TRIED) if wished else (0,):
+        try:
+            page = ViewServer(node.keeper, port, config.view.host)
+        except (OSError, OverflowError):
+            continue
+        page.start()
+        log.info("page %s", page.url)
+        return page
+    log.warning("no page: ports %d to %d of %s are taken", wished, wished + PORTS_TRIED - 1, config.view.host)
+    return None
+
+
+def ready_line(node: Node, page: ViewServer | None) -> dict[str, Any]:
+    node.keeper.locators = node.fleet.exchange.locators()
+    return {
+        "ready": True,
+        "robot": node.robot,
+        "pid": os.getpid(),
+        "locators": node.keeper.locators,
+        "page": page.url if page else None,
+        "control": str(node.control.path) if node.control else None,
+    }
+
+
+class StopSignals:
+    """SIGTERM and Ctrl-C ask for a clean stop; the second one goes at once."""
+
+    def __init__(self) -> None:
+        self._action: Callable[[], None] = lambda: os._exit(130)
+        self._count = 0
+        signal.signal(signal.SIGTERM, self._on_signal)
+        signal.signal(signal.SIGINT, self._on_signal)
+        faulthandler.enable()  # systemd's watchdog sends SIGABRT: leave a trace of every thread
+
+    def then(self, action: Callable[[], None]) -> None:
+        self._action = action
+
+    def _on_signal(self, number: int, _: object) -> None:
+        self._count += 1
+        if self._count > 1:
+            os._exit(128 + number)
+        self._action()
+
+
+@contextlib.contextmanager
+def exit_watchdog(stopping: threading.Event) -> Any:
+    """Once stopping began the process ends, even when a library hangs."""
+    done = threading.Event()
+
+    def watch() -> None:
+        stopping.wait()
+        if not done.wait(EXIT_WATCHDOG_S):
+            sys.stderr.write("mapquilt: stopping took too long, leaving anyway\n")
+            os._exit(OK)
+
+    threading.Thread(target=watch, name="exit-watchdog", daemon=True).start()
+    try:
+        yield
+    finally:
+        stopping.set()
+        done.set()
+
+
+def die_with_parent() -> None:
+    """The kernel ends this process when its parent ends, however that happens."""
+    parent = os.getppid()
+    ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+    if os.getppid() != parent or parent == 1:
+        raise CommandError("the process that started this robot is gone", ENVIRONMENT)

@@ -1,0 +1,205 @@
+"""One robot's process: the workers, what flows between them, and how they start and stop.
+
+worker     reads                     writes                    deadline
+lidar      LIDAR device              readings                  5 s
+wheels     wheel device              readings                  5 s
+map        readings                  estimates                 10 s
+features   estimates                 own map, for the fleet    20 s
+fleet      messages, results, time   messages, jobs            5 s
+pull-*     fetches                   pulled messages           60 s
+merge      match and fuse jobs       results                   120 s
+keeper     everything, to look       disk, links               30 s
+
+Values only flow to the right and down; every arrow is a mailbox that never grows.  The main thread feeds the watchdog.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import secrets
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from agent.config import Config
+from agent.features.snapshot import MapSnapshot
+from agent.fleet.coordinator import Coordinator
+from agent.fleet.options import FleetOptions
+from agent.mapping.mapper import Mapper
+from agent.mapping.options import MappingOptions
+from agent.merging.result import MatchOptions
+from agent.runtime.control import ControlServer
+from agent.runtime.fleet_worker import FleetWorker
+from agent.runtime.health import Health, Notifier, watchdog_period_s
+from agent.runtime.keeper import Keeper
+from agent.runtime.map_worker import MapWorker
+from agent.runtime.merge_worker import MergeWorker
+from agent.runtime.network import NetworkSettings
+from agent.runtime.records import Records
+from agent.runtime.sensing import Readings, device_step
+from agent.runtime.state import StateDirectory
+from agent.runtime.worker import Worker, WorkerReport
+from hw.device import Source, open_lidar, open_wheels
+from protocol.geometry import SE2
+
+log = logging.getLogger(__name__)
+
+STOP_WITHIN_S = 1.5  # what the workers have to come back; the whole stop stays below 2 s
+
+
+class Node:
+    """A running robot.  Use with `with`: leaving stops every thread and closes every device, whatever happened."""
+
+    def __init__(self, config: Config, state_folder: Path | None, control_socket: Path | None) -> None:
+        self.config = config
+        self.robot = config.robot.id
+        self.boot_id = secrets.randbits(63)
+        self.started_s = time.monotonic()
+        self.state = StateDirectory(state_folder) if state_folder is not None else None
+        self.records = Records(state_folder / "records.jsonl" if state_folder is not None else None)
+        self.lidar: Source = open_lidar(config.lidar.url)
+        self.wheels: Source | None = open_wheels(config.wheels.url) if config.wheels.url else None
+        self.readings = Readings()
+        self.map = MapWorker(self._mapper(), self.readings)
+        self.merger = MergeWorker(match_options(config))
+        coordinator = Coordinator(self.robot, self.boot_id, FleetOptions(min_match_factor=config.matching.min_match_factor))
+        self.fleet = FleetWorker(coordinator, network_settings(config), self.merger, on_note=self.records.add)
+        self.keeper = Keeper(self)
+        self.workers = self._workers()
+        self.health = Health(self.reports, Notifier())
+        self.control = ControlServer(control_socket, self.keeper.commands()) if control_socket is not None else None
+        self.stopping = threading.Event()
+
+    def _workers(self) -> list[Worker]:
+        """The table above, in the order in which they start; they stop in the reverse order."""
+        row = Worker
+        table = [
+            row("merge", self.merger.step, 120.0, "match and fuse jobs", "results"),
+            row("fleet", self.fleet.step, 5.0, "messages, results, time", "messages, jobs"),
+            *(row(f"pull-bulk-{i}", self.fleet.bulk_step, 60.0, "fetches", "pulled messages") for i in (1, 2)),
+            *(row(f"pull-small-{i}", self.fleet.small_step, 60.0, "fetches", "pulled messages") for i in (1, 2, 3)),
+            row("features", self._features_step, 20.0, "estimates", "own map, for the fleet"),
+            row("map", self.map.step, 10.0, "readings", "estimates"),
+            row("lidar", device_step(self.lidar, self.readings), 5.0, "LIDAR device", "readings"),
+            row("keeper", self.keeper.step, 30.0, "everything, to look", "disk, links"),
+        ]
+        if self.wheels is not None:
+            table.append(row("wheels", device_step(self.wheels, self.readings), 5.0, "wheel device", "readings"))
+        return table
+
+    def _mapper(self) -> Mapper:
+        """Where the last run stopped when its map is on disk and sound, else a new one."""
+        options = mapping_options(self.config)
+        saved = self.state.load("mapper") if self.state is not None else None
+        if saved is not None:
+            try:
+                mapper = Mapper.restore(saved, options)
+                log.info("restored the local map of the last run bytes=%d", len(saved))
+                return mapper
+            except Exception as error:  # whatever an older program wrote: a robot starts
+                log.warning("the saved map does not fit this program, starting a new one: %s", error)
+        return Mapper(options, seed=self.config.mapping.seed)
+
+    def _features_step(self) -> None:
+        estimate = self.map.estimates.take(0.25)
+        if estimate is None:
+            return
+        self.fleet.poses.put(estimate.T_map_robot)
+        self.fleet.local_maps.put((estimate, MapSnapshot.of(estimate.grid).features))
+
+    def __enter__(self) -> Node:
+        try:
+            self.fleet.exchange.open()
+            if self.control is not None:
+                self.control.start()
+            self.lidar.start()
+            if self.wheels is not None:
+                self.wheels.start()
+            for worker in self.workers:
+                worker.start()
+        except BaseException:
+            self.stop()
+            raise
+        self.health.look("starting")
+        Notifier().send("READY=1")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def run(self, on_turn: Callable[[], bool] = lambda: True) -> None:
+        """Until `stopping` is set or `on_turn` says False: feed the watchdog while every worker makes progress."""
+        while not self.stopping.wait(watchdog_period_s()) and on_turn():
+            before = self.health.stuck
+            self.health.look(self.keeper.summary())
+            if self.health.stuck and self.health.stuck != before:
+                log.error("no progress: %s; the watchdog is not fed", ", ".join(self.health.stuck))
+
+    def stop(self) -> None:
+        """Everything ends, in the reverse order of starting; the map is saved last."""
+        self.stopping.set()
+        Notifier().send("STOPPING=1")
+        started = time.monotonic()
+        for worker in self.workers:
+            worker.ask_to_stop()
+        if self.control is not None:
+            self.control.close()
+        for worker in reversed(self.workers):
+            if not worker.join(STOP_WITHIN_S - (time.monotonic() - started)):
+                log.warning("worker=%s does not stop, left behind", worker.name)
+        self.keeper.save_now()
+        for device in (self.lidar, self.wheels):
+            if device is not None:
+                device.stop()
+        self.fleet.exchange.close()
+
+    def reset_map(self) -> None:
+        """Begin a new local map in a new frame; peers learn from its epoch that the old one is gone."""
+
+        def begin() -> None:
+            epoch = self.map.mapper.epoch + 1
+            self.map.mapper = Mapper(mapping_options(self.config), seed=self.config.mapping.seed)
+            self.map.mapper.epoch = epoch
+            if self.state is not None:
+                self.state.forget("mapper")
+
+        self.map.call(begin)
+
+    def reports(self) -> list[WorkerReport]:
+        return [worker.report() for worker in self.workers]
+
+
+def mapping_options(config: Config) -> MappingOptions:
+    lidar, mapping = config.lidar, config.mapping
+    more: dict[str, Any] = {"matching_range_m": mapping.max_range_m} if mapping.max_range_m > 0.0 else {}
+    return MappingOptions(
+        resolution_m=mapping.resolution_m,
+        particles=mapping.particles,
+        T_base_laser=SE2(lidar.mount_x_m, lidar.mount_y_m, math.radians(lidar.mount_yaw_deg)),
+        **more,
+    )
+
+
+def match_options(config: Config) -> MatchOptions:
+    matching = config.matching
+    return MatchOptions(
+        method=matching.method, min_match_factor=matching.min_match_factor, size_tolerance=matching.size_tolerance
+    )
+
+
+def network_settings(config: Config) -> NetworkSettings:
+    fleet = config.fleet
+    return NetworkSettings(
+        robot=config.robot.id,
+        fleet=fleet.name,
+        profile=fleet.profile,
+        listen=fleet.listen,
+        connect=fleet.connect,
+        security=fleet.security,
+        allow_open=fleet.allow_open,
+        key_file=Path(fleet.key_file) if fleet.key_file else None,
+        certificates=Path(fleet.certificates) if fleet.certificates else None,
+    ).checked()
