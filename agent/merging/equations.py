@@ -80,6 +80,19 @@ class FactorCounter:
         return (rows, cols) if rows.start < rows.stop and cols.start < cols.stop else None
 
 
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A transform that the features voted for, and what the cells say about it."""
+
+    T_ours_theirs: SE2
+    factor: MatchFactor
+
+
+def overlap_m2(factor: MatchFactor, ours: OccupancyGrid) -> float:
+    """Area known to both maps; the factor counts cells of ours."""
+    return (factor.agree + factor.disagree) * ours.resolution_m**2
+
+
 def _coded(grid: OccupancyGrid, free: int, wall: int) -> NDArray[np.uint8]:
     codes = np.zeros(grid.cells.shape, np.uint8)
     codes[grid.cells == FREE] = free

@@ -1,6 +1,7 @@
 """What can go wrong when maps are put together.  "No match" is not among them: that is a `MergeResult`.
 
 MergingError
+  MapArrayError   an array that is no occupancy map
   FusionError     these maps cannot be drawn as one: a transform that is no transform, or a result beyond the size limit
 """
 
@@ -13,3 +14,7 @@ class MergingError(Exception):
 
 class FusionError(MergingError):
     """The maps cannot be drawn into one grid."""
+
+
+class MapArrayError(MergingError):
+    """An array from outside is not an occupancy map."""

@@ -20,8 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.features.paper import FeatureRows, PaperFeatures, paper_features
-from agent.merging.equations import FactorCounter
-from agent.merging.result import MatchFactor, MatchOptions, MatchStatus, MergeResult, Reason
+from agent.features.snapshot import MapSnapshot
+from agent.merging.equations import Candidate, FactorCounter, overlap_m2
+from agent.merging.paper_guard import choose_guarded
+from agent.merging.result import MatchOptions, MatchStatus, MergeResult, Reason
 from protocol.geometry import SE2
 from protocol.grid import OccupancyGrid
 
@@ -43,12 +45,10 @@ class SimilarFeatures:
         return len(self.ours)
 
 
-@dataclass(frozen=True, slots=True)
-class Candidate:
-    """A transform that the features voted for, and what the cells say about it."""
-
-    T_ours_theirs: SE2
-    factor: MatchFactor
+def match_maps_like_the_paper(ours: MapSnapshot, theirs: MapSnapshot, options: MatchOptions) -> MergeResult:
+    """`method = "paper"`, and `"paper-guarded"`."""
+    guarded = options.method == "paper-guarded"
+    return (match_guarded if guarded else match_by_the_paper)(ours.grid, theirs.grid, options)
 
 
 def match_by_the_paper(ours: OccupancyGrid, theirs: OccupancyGrid, options: MatchOptions) -> MergeResult:
@@ -67,6 +67,11 @@ def match_by_the_paper(ours: OccupancyGrid, theirs: OccupancyGrid, options: Matc
         candidates_tried=len(candidates),
         reason=Reason.MATCHED if is_accepted else Reason.LOW_MATCH_FACTOR,
     )
+
+
+def match_guarded(ours: OccupancyGrid, theirs: OccupancyGrid, options: MatchOptions) -> MergeResult:
+    """Algorithm 1's candidates, chosen and judged with the guards of `paper_guard.py`."""
+    return choose_guarded(ours, theirs, paper_candidates(ours, theirs, options), options)
 
 
 def paper_candidates(ours: OccupancyGrid, theirs: OccupancyGrid, options: MatchOptions) -> list[Candidate]:
@@ -121,8 +126,3 @@ def _most_frequent(votes: NDArray[np.int64], limit: int) -> list[int]:
     values, counts = np.unique(votes, return_counts=True)
     most: list[int] = values[np.argsort(-counts, kind="stable")][:limit].tolist()
     return most
-
-
-def overlap_m2(factor: MatchFactor, ours: OccupancyGrid) -> float:
-    """Area known to both maps; the factor counts cells of ours."""
-    return (factor.agree + factor.disagree) * ours.resolution_m**2

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.merging.paper import Candidate, overlap_m2, paper_candidates
+from agent.merging.equations import Candidate, overlap_m2
 from agent.merging.result import Alternative, MatchOptions, MatchStatus, MergeResult, Reason
 from protocol.geometry import SE2, wrap_angle
 from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
@@ -27,10 +27,9 @@ DISTINCT_M, DISTINCT_RAD = 0.8, 0.105  # candidates nearer than this (6 degrees)
 _MAX_POINTS = 2000  # a map: enough to weigh 100 m of wall to 5 %
 
 
-def match_guarded(ours: OccupancyGrid, theirs: OccupancyGrid, options: MatchOptions) -> MergeResult:
-    """Algorithm 1 with guards; NO and AMBIGUOUS carry the best hypothesis and the numbers."""
+def choose_guarded(ours: OccupancyGrid, theirs: OccupancyGrid, candidates: list[Candidate], options: MatchOptions) -> MergeResult:
+    """The verdict on the paper's candidates; NO and AMBIGUOUS carry the best hypothesis and the numbers."""
     smaller_m2 = min(ours.known_area_m2(), theirs.known_area_m2())
-    candidates = paper_candidates(ours, theirs, options)
     wide = [c for c in candidates if overlap_m2(c.factor, ours) >= MIN_OVERLAP * smaller_m2]
     if not wide:
         return MergeResult.none(Reason.NO_CANDIDATES)

@@ -9,12 +9,11 @@ import pytest
 from hypothesis import given, settings
 
 from agent.features.paper import PaperFeatures
-from agent.merging.paper import match_by_the_paper, rotation_candidates, similar_features, translation_candidates
-from agent.merging.paper_guard import match_guarded
+from agent.merging.paper import match_by_the_paper, match_guarded, rotation_candidates, similar_features, translation_candidates
 from agent.merging.result import MatchOptions, MatchStatus, Reason
 from protocol.geometry import SE2, wrap_angle
 from protocol.grid import OCCUPIED, OccupancyGrid
-from tests.features.test_paper import any_cells
+from tests.agent.features.test_paper import any_cells
 from tests.harness.floorplans import FloorPlan, office
 
 OPTIONS = MatchOptions(method="paper")
