@@ -5,11 +5,23 @@ The derived parts live in the *grid frame* (see `working.py`), so a map whose or
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable
 from functools import cached_property
+from typing import Any, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.features.corners import Corners, corners_of
+from agent.features.directions import direction_spectrum
+from agent.features.field import MatchField
+from agent.features.lines import WallLines, wall_lines
+from agent.features.wall_points import WallPoints, wall_points
 from agent.features.working import WorkingGrid
 from protocol.features import FeatureMap
 from protocol.grid import OccupancyGrid
+
+T = TypeVar("T")
 
 
 class MapSnapshot:
@@ -17,6 +29,7 @@ class MapSnapshot:
 
     def __init__(self, grid: OccupancyGrid) -> None:
         self.grid = grid
+        self._kept: dict[Hashable, Any] = {}
 
     @staticmethod
     def of(grid: OccupancyGrid) -> MapSnapshot:
@@ -26,11 +39,51 @@ class MapSnapshot:
         """The snapshot of a later state of the same map."""
         return MapSnapshot(grid)
 
+    def kept(self, key: Hashable, make: Callable[[MapSnapshot], T]) -> T:
+        """What `make` derives from this snapshot, made once: rooms above keep their own views of a map here."""
+        if key not in self._kept:
+            self._kept[key] = make(self)
+        value: T = self._kept[key]
+        return value
+
+    @property
+    def middle_m(self) -> NDArray[np.float64]:
+        """(2,) middle of the grid, grid frame."""
+        height, width = self.working.free.shape
+        return np.array([width, height]) * (self.working.resolution_m / 2)
+
     @cached_property
     def working(self) -> WorkingGrid:
         return WorkingGrid.of(self.grid)
 
     @cached_property
+    def walls(self) -> WallPoints:
+        """Every surface cell as an oriented point."""
+        return wall_points(self.working)
+
+    @cached_property
+    def thin_walls(self) -> WallPoints:
+        """One oriented point every 20 cm of wall."""
+        return self.walls.thin
+
+    @cached_property
+    def field(self) -> MatchField:
+        return MatchField.of(self.working, self.walls)
+
+    @cached_property
+    def lines(self) -> WallLines:
+        return wall_lines(self.walls, self.working.resolution_m)
+
+    @cached_property
+    def corners(self) -> Corners:
+        return corners_of(self.lines)
+
+    @cached_property
+    def directions(self) -> NDArray[np.complex128]:
+        """Fourier transform of the histogram of wall directions."""
+        return direction_spectrum(self.lines)
+
+    @cached_property
     def features(self) -> FeatureMap:
         """What travels and what a person can read."""
-        return FeatureMap()
+        return FeatureMap(lines=self.lines.table(self.grid.origin))

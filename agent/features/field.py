@@ -1,0 +1,62 @@
+"""What a map says at a place, made to be asked millions of times: one byte a cell, and the index of the nearest wall point.
+
+byte  0..63   within tolerance of a wall, whose signed normal points this way (64 bins over the full turn)
+      254     free, and farther than the tolerance from any wall
+      255     no evidence: unknown, or outside
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.features.wall_points import WallPoints, direction_bins
+from agent.features.working import WorkingGrid
+
+DIRECTION_BINS = 64
+FREE_BYTE = 254
+UNKNOWN_BYTE = 255
+FINE_TOLERANCE_M = 0.25  # a wall this near is the same wall; also what a judge calls agreement
+COARSE_TOLERANCE_M = 0.35  # for candidates that are not refined yet
+REACH_M = 0.80  # refinement pulls walls together from here
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MatchField:
+    """Images over the working grid."""
+
+    fine: NDArray[np.uint8]  # (H, W) bytes as above, tolerance FINE_TOLERANCE_M
+    coarse: NDArray[np.uint8]  # (H, W) the same, tolerance COARSE_TOLERANCE_M
+    nearest: NDArray[
+        np.float32
+    ]  # (H, W) index of the nearest wall point, -1 beyond REACH_M; float because cv2.remap takes no int32
+    resolution_m: float
+
+    @staticmethod
+    def of(grid: WorkingGrid, walls: WallPoints) -> MatchField:
+        distance_m, nearest = _nearest_wall(grid, walls)
+        bins = direction_bins(walls.angles_rad, DIRECTION_BINS)
+        direction = bins[np.maximum(nearest, 0)] if len(walls) else np.zeros(nearest.shape, np.uint8)
+        nothing = np.where(grid.free.view(np.bool_), np.uint8(FREE_BYTE), np.uint8(UNKNOWN_BYTE))
+        return MatchField(
+            np.where(distance_m <= max(FINE_TOLERANCE_M, 1.25 * grid.resolution_m), direction, nothing),
+            np.where(distance_m <= max(COARSE_TOLERANCE_M, 1.5 * grid.resolution_m), direction, nothing),
+            np.where(distance_m <= REACH_M, nearest, -1).astype(np.float32),
+            grid.resolution_m,
+        )
+
+
+def _nearest_wall(grid: WorkingGrid, walls: WallPoints) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """(H, W) distance to the nearest surface cell, metres, and its row in `walls`."""
+    if not len(walls):
+        return np.full(grid.free.shape, np.inf, np.float32), np.full(grid.free.shape, -1, np.int32)
+    apart = np.ones(grid.free.shape, np.uint8)
+    rows, cols = walls.cells_rc.T
+    apart[rows, cols] = 0
+    distance, labels = cv2.distanceTransformWithLabels(apart, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    index_of = np.zeros(len(walls) + 1, np.int32)
+    index_of[labels[rows, cols]] = np.arange(len(walls), dtype=np.int32)
+    return distance * np.float32(grid.resolution_m), index_of[labels]

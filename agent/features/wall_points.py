@@ -1,0 +1,133 @@
+"""Wall surfaces as oriented points: where a wall meets free space, which way it runs, and which side is free.
+
+A surface cell is an occupied cell with a free neighbour.  The occupied cells around it give its tangent (principal
+component), its position below the cell (on the local line) and its linearity; the free cells around it give the normal its
+sign, so normals span the full turn and a corridor's two walls are different things.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.features.working import WorkingGrid
+
+WINDOW_M = 0.45  # radius in which the local line is fitted: shorter is noisy, longer rounds corners off
+SPACING_M = 0.20  # one point stands for this much wall
+MAX_SURFACE_CELLS = 150_000  # a checkerboard is all surface; a 250 m campus has 40,000
+
+
+@dataclass(frozen=True, eq=False)
+class WallPoints:
+    """One row a surface cell, in the grid frame."""
+
+    cells_rc: NDArray[np.int32]  # (N, 2)
+    positions_m: NDArray[np.float32]  # (N, 2) on the local line
+    normals: NDArray[np.float32]  # (N, 2) unit, towards the free side
+    linearity: NDArray[np.float32]  # (N,) 0 blob .. 1 line
+
+    def __len__(self) -> int:
+        return len(self.cells_rc)
+
+    @cached_property
+    def angles_rad(self) -> NDArray[np.float32]:
+        """(N,) direction of the normals, [-pi, pi]."""
+        angles: NDArray[np.float32] = np.arctan2(self.normals[:, 1], self.normals[:, 0])
+        return angles
+
+    @cached_property
+    def thin(self) -> WallPoints:
+        """One point every `SPACING_M` of wall: the straightest of each voxel."""
+        voxel = np.floor(self.positions_m / SPACING_M).astype(np.int64)
+        key = (voxel[:, 0] << 32) + voxel[:, 1]
+        order = np.lexsort((np.arange(len(key)), -self.linearity, key))
+        first = np.ones(len(order), np.bool_)
+        first[1:] = np.diff(key[order]) != 0
+        return self.subset(np.sort(order[first]))
+
+    def subset(self, index: NDArray[np.int64]) -> WallPoints:
+        return WallPoints(self.cells_rc[index], self.positions_m[index], self.normals[index], self.linearity[index])
+
+
+def surface_cells(grid: WorkingGrid) -> NDArray[np.int32]:
+    """(N, 2) (row, col) of the occupied cells that touch free space."""
+    reached = cv2.dilate(grid.free, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    found = cv2.findNonZero(reached & grid.occupied)
+    if found is None:
+        return np.zeros((0, 2), np.int32)
+    cells = found.reshape(-1, 2)[:, ::-1].astype(np.int32)
+    stride = -(-len(cells) // MAX_SURFACE_CELLS)
+    return np.ascontiguousarray(cells[::stride])
+
+
+def wall_points(grid: WorkingGrid, cells_rc: NDArray[np.int32] | None = None) -> WallPoints:
+    """Oriented points of the given surface cells (default: all of the grid)."""
+    cells = surface_cells(grid) if cells_rc is None else cells_rc
+    parts = [_fitted(grid, cells[i : i + 8192]) for i in range(0, max(1, len(cells)), 8192)]
+    position, normal, linearity = (np.concatenate([part[k] for part in parts]) for k in range(3))
+    return WallPoints(cells, position, normal, linearity)
+
+
+def _fitted(grid: WorkingGrid, cells: NDArray[np.int32]) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Positions, normals and linearities of some surface cells."""
+    offsets, weights = _window(grid.resolution_m)
+    reach = int(np.abs(offsets).max())
+    rows, cols = grid.occupied.shape
+    around = np.ascontiguousarray(cells[:, None, :] + offsets[None])  # (N, K, 2)
+    inside = ((around >= 0) & (around < (rows, cols))).all(axis=2) if _touches_edge(cells, reach, rows, cols) else None
+    flat = around[..., 0] * cols + around[..., 1]
+    if inside is not None:
+        flat = np.where(inside, flat, 0)
+    occupied = grid.occupied.ravel().take(flat).astype(np.float32)
+    free = grid.free.ravel().take(flat).astype(np.float32)
+    if inside is not None:
+        occupied *= inside
+        free *= inside
+    y, x = offsets[:, 0] * grid.resolution_m, offsets[:, 1] * grid.resolution_m
+    moments = occupied @ (weights[:, None] * np.stack([np.ones_like(x), x, y, x * x, y * y, x * y], axis=1)).astype(np.float32)
+    towards_free = free @ np.stack([x, y], axis=1).astype(np.float32)
+    centre, normal, linearity = _principal(moments)
+    flip = np.sign((towards_free * normal).sum(axis=1, keepdims=True))
+    normal = (normal * np.where(flip == 0, 1, flip)).astype(np.float32)
+    shift = (centre * normal).sum(axis=1, keepdims=True) * normal
+    positions = (cells[:, ::-1] + np.float32(0.5)) * np.float32(grid.resolution_m) + shift
+    return positions.astype(np.float32), normal, linearity
+
+
+def _touches_edge(cells: NDArray[np.int32], reach: int, rows: int, cols: int) -> bool:
+    return bool(len(cells)) and not bool(
+        (cells.min(axis=0) >= reach).all() and (cells.max(axis=0) < (rows - reach, cols - reach)).all()
+    )
+
+
+def _window(resolution_m: float) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    """(K, 2) cell offsets (row, col) within the window and their weights."""
+    radius_m = max(WINDOW_M, 2.3 * resolution_m)
+    n = int(radius_m / resolution_m)
+    dy, dx = np.mgrid[-n : n + 1, -n : n + 1]
+    d2 = (dx * dx + dy * dy) * (resolution_m / radius_m) ** 2
+    keep = d2 <= 1.0
+    return np.stack([dy[keep], dx[keep]], axis=1).astype(np.int32), 1.0 - 0.6 * d2[keep]
+
+
+def _principal(moments: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Centroid (N, 2), unit normal (N, 2) and linearity (N,) from the moments [1, x, y, xx, yy, xy] of the occupied cells."""
+    m = np.maximum(moments[:, :1], 1e-6)
+    x, y, xx, yy, xy = (moments[:, 1:] / m).T
+    cxx, cyy, cxy = xx - x * x, yy - y * y, xy - x * y
+    half = np.hypot((cxx - cyy) / 2, cxy)
+    tangent = 0.5 * np.arctan2(2 * cxy, cxx - cyy)
+    linearity = 2 * half / np.maximum(cxx + cyy, 1e-9)
+    normal = np.stack([-np.sin(tangent), np.cos(tangent)], axis=1)
+    return np.stack([x, y], axis=1), normal, linearity.astype(np.float32)
+
+
+def direction_bins(angles_rad: NDArray[np.floating], bins: int) -> NDArray[np.uint8]:
+    """Angles as bin numbers 0 .. bins - 1, bin 0 centred on zero."""
+    numbers: NDArray[np.uint8] = (np.rint(angles_rad * (bins / math.tau)).astype(np.int64) % bins).astype(np.uint8)
+    return numbers

@@ -1,0 +1,134 @@
+"""Candidates pulled into place: symmetric point-to-line Gauss-Newton, all candidates at once.
+
+Wall points of either map are drawn to the local line of the nearest wall point of the other, where the two face the same
+way.  The gate narrows from 0.8 m to 0.15 m, so a candidate may start a coarse cell off and ends below a tenth of one.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.features.field import MatchField
+from agent.features.wall_points import WallPoints
+from agent.merging.scoring import placed
+from agent.merging.transforms import Poses, inverted
+
+SIGMA_M = 0.05  # how far wall points of two good maps lie apart
+MIN_COSINE = 0.7
+MIN_LINEARITY = 0.5
+GATES_M = (0.8, 0.6, 0.4, 0.3, 0.2, 0.15)
+FINE_GATES_M = (0.3, 0.2, 0.15, 0.15)
+_Floats = NDArray[np.floating]
+_STIFFNESS = 1e-3  # times the points: keeps an unobservable direction still
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Side:
+    """What refinement needs of one map."""
+
+    xy1: NDArray[np.float32]  # (3, P) the points it offers
+    normals: NDArray[np.float32]  # (P, 2)
+    field: MatchField
+    wall_xy: NDArray[np.float32]  # (N + 1, 2) all wall points; the last row is "none near"
+    wall_normals: NDArray[np.float32]  # (N + 1, 2), zero where too curved to pull
+
+    @staticmethod
+    def of(thin: WallPoints, walls: WallPoints, field: MatchField, count: int) -> Side:
+        straight = np.flatnonzero(thin.linearity > MIN_LINEARITY)
+        if len(straight) > count:
+            straight = straight[np.linspace(0, len(straight) - 1, count).astype(np.int64)]
+        xy1 = np.ones((3, len(straight)), np.float32)
+        xy1[:2] = thin.positions_m[straight].T
+        none = np.zeros((1, 2), np.float32)
+        usable = (walls.linearity > MIN_LINEARITY)[:, None]
+        return Side(
+            xy1,
+            thin.normals[straight],
+            field,
+            np.concatenate([walls.positions_m, none]),
+            np.concatenate([walls.normals * usable, none]),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Normal:
+    """Normal equations of every candidate about the middle of its inliers."""
+
+    H: NDArray[np.float64]  # (C, 3, 3)
+    g: NDArray[np.float64]  # (C, 3)
+    centre: NDArray[np.float64]  # (C, 2) in our frame
+    inliers: NDArray[np.float64]  # (C,)
+    squares: NDArray[np.float64]  # (C,) weighted sum of squared residuals
+
+
+def refined(ours: Side, theirs: Side, poses: Poses, gates_m: tuple[float, ...] = GATES_M) -> Poses:
+    """The candidates after one Gauss-Newton step a gate."""
+    poses = np.array(poses, np.float64)
+    for gate_m in gates_m:
+        poses = stepped(poses, normal_equations(ours, theirs, poses, gate_m))
+    return poses
+
+
+def stepped(poses: Poses, normal: Normal) -> Poses:
+    """One Gauss-Newton step, bounded to half a metre and six degrees."""
+    stiff = (_STIFFNESS * normal.inliers + 1e-6)[:, None, None] * np.eye(3)
+    step = -np.linalg.solve(normal.H + stiff, normal.g[..., None])[..., 0]
+    length = np.hypot(step[:, 0], step[:, 1])
+    step[:, :2] *= np.minimum(1.0, 0.5 / np.maximum(length, 1e-9))[:, None]
+    turn = np.clip(step[:, 2], -0.1, 0.1)
+    c, s = np.cos(turn), np.sin(turn)
+    away = poses[:, :2] - normal.centre
+    x = normal.centre[:, 0] + c * away[:, 0] - s * away[:, 1] + step[:, 0]
+    y = normal.centre[:, 1] + s * away[:, 0] + c * away[:, 1] + step[:, 1]
+    return np.stack([x, y, np.remainder(poses[:, 2] + turn + math.pi, math.tau) - math.pi], axis=1)
+
+
+def normal_equations(ours: Side, theirs: Side, poses: Poses, gate_m: float) -> Normal:
+    """Both directions, everything expressed in our frame."""
+    c, s = np.cos(poses[:, 2])[:, None], np.sin(poses[:, 2])[:, None]
+    # their points on our lines
+    px, py, qx, qy, nx, ny, own = _partners(theirs, ours, poses)
+    tx, ty = poses[:, :1] + c * px - s * py, poses[:, 1:2] + s * px + c * py
+    facing = nx * (c * own[0] - s * own[1]) + ny * (s * own[0] + c * own[1])
+    forth = _terms(tx, ty, tx - qx, ty - qy, nx, ny, facing, gate_m)
+    # our points on their lines
+    px, py, qx, qy, nx, ny, own = _partners(ours, theirs, inverted(poses))
+    rx, ry = poses[:, :1] + c * qx - s * qy, poses[:, 1:2] + s * qx + c * qy
+    mx, my = c * nx - s * ny, s * nx + c * ny
+    back = _terms(rx, ry, rx - px, ry - py, mx, my, mx * own[0] + my * own[1], gate_m)
+    x, y, e, nx, ny, w = (np.concatenate(pair, axis=1) for pair in zip(forth, back, strict=True))
+    inliers = np.maximum((w > 0).sum(axis=1), 1).astype(np.float64)
+    total = np.maximum(w.sum(axis=1), 1e-9)
+    centre = np.stack([(w * x).sum(axis=1), (w * y).sum(axis=1)], axis=1) / total[:, None]
+    lever = ny * (x - centre[:, :1].astype(np.float32)) - nx * (y - centre[:, 1:].astype(np.float32))
+    J = np.stack([nx, ny, lever], axis=1)  # (C, 3, P)
+    weighted = J * w[:, None, :]
+    H = (weighted @ J.transpose(0, 2, 1)).astype(np.float64)
+    g = (weighted @ e[..., None])[..., 0].astype(np.float64)
+    return Normal(H, g, centre, inliers, (w * e * e).sum(axis=1).astype(np.float64))
+
+
+def _partners(points: Side, lines: Side, poses: Poses) -> tuple[_Floats, ...]:
+    """Points (1, P), and for every candidate the nearest wall point of the other map (C, P) with its normal."""
+    columns, rows = placed(points.xy1, poses, lines.field.resolution_m)
+    found = cv2.remap(lines.field.nearest, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=-1)
+    index = found.astype(np.int32)
+    q, n = lines.wall_xy[index], lines.wall_normals[index]
+    own = points.normals.T
+    return points.xy1[:1], points.xy1[1:2], q[..., 0], q[..., 1], n[..., 0], n[..., 1], own
+
+
+def _terms(
+    x: _Floats, y: _Floats, ex: _Floats, ey: _Floats, nx: _Floats, ny: _Floats, facing: _Floats, gate_m: float
+) -> tuple[_Floats, ...]:
+    """Place, residual, normal and weight of every pair; weight zero where it does not count."""
+    e = nx * ex + ny * ey
+    keep = (facing > MIN_COSINE) & (ex * ex + ey * ey < (gate_m + 0.1) ** 2) & (np.abs(e) < gate_m)
+    soft = max(2 * SIGMA_M, 0.5 * gate_m)
+    w = np.where(keep, 1.0 / (1.0 + (e / soft) ** 2), 0.0).astype(np.float32)
+    return (*(v.astype(np.float32) for v in (x, y, e, nx, ny)), w)

@@ -1,0 +1,90 @@
+"""How well wall points of one map sit on another, for thousands of transforms at once.
+
+One gather and one look-up a point: the field's byte and the point's own direction bin index a table of what that
+combination is worth, in metres of wall.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.features.field import DIRECTION_BINS, FREE_BYTE
+from agent.features.wall_points import SPACING_M, WallPoints, direction_bins
+from agent.merging.transforms import Poses
+
+AGREE_BINS = 9  # normals within 51 degrees agree: corners and clutter turn normals, walls of a corridor differ by 180
+OPPOSITE_BINS = 23  # beyond 129 degrees: the far side of a thin wall, no evidence either way
+_BLOCK = 400_000  # points at a time, so that temporaries stay in cache
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Probe:
+    """Points of a map made ready for scoring, grid frame."""
+
+    xy1: NDArray[np.float32]  # (3, P) x, y, 1
+    bins: NDArray[np.uint8]  # (P,) direction of the normals
+    wall_m: float  # wall that one point stands for
+
+    @staticmethod
+    def of(walls: WallPoints, wall_m: float = SPACING_M) -> Probe:
+        xy1 = np.ones((3, len(walls)), np.float32)
+        xy1[:2] = walls.positions_m.T
+        return Probe(xy1, direction_bins(walls.angles_rad, DIRECTION_BINS), wall_m)
+
+    @staticmethod
+    def sample(walls: WallPoints, count: int) -> Probe:
+        """About `count` points spread evenly over the map's walls."""
+        if len(walls) <= count:
+            return Probe.of(walls)
+        index = np.linspace(0, len(walls) - 1, count).astype(np.int64)
+        return Probe.of(walls.subset(index), SPACING_M * len(walls) / count)
+
+
+def worth_table(hit: float, conflict: float, crossing: float) -> NDArray[np.float32]:
+    """(256 * 64,) worth of a point by field byte and direction bin: agreeing, on free space, near but perpendicular."""
+    byte, own = np.arange(256)[:, None], np.arange(DIRECTION_BINS)[None, :]
+    apart = np.abs((byte - own + DIRECTION_BINS // 2) % DIRECTION_BINS - DIRECTION_BINS // 2)
+    wall = np.where(apart <= AGREE_BINS, hit, np.where(apart < OPPOSITE_BINS, crossing, 0.0))
+    worth = np.where(byte < DIRECTION_BINS, wall, np.where(byte == FREE_BYTE, conflict, 0.0))
+    return worth.astype(np.float32).ravel()
+
+
+SEARCH_WORTH = worth_table(hit=1.0, conflict=-1.2, crossing=-0.2)
+
+
+def readings(field: NDArray[np.uint8], resolution_m: float, probe: Probe, poses: Poses) -> NDArray[np.uint16]:
+    """(C, P) field byte and direction bin of every point under every transform, as one table index."""
+    x, y = placed(probe.xy1, poses, resolution_m)
+    seen = cv2.remap(field, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=255)
+    turn = np.rint(poses[:, 2] * (DIRECTION_BINS / math.tau)).astype(np.int64).astype(np.uint8)
+    index: NDArray[np.uint16] = seen.astype(np.uint16)
+    index <<= 6
+    index |= (probe.bins[None, :] + turn[:, None]) & 63
+    return index
+
+
+def placed(xy1: NDArray[np.float32], poses: Poses, resolution_m: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(C, P) columns and rows, in cv2's pixel coordinates, of the points under every transform."""
+    c, s = np.cos(poses[:, 2]) / resolution_m, np.sin(poses[:, 2]) / resolution_m
+    x0, y0 = poses[:, 0] / resolution_m - 0.5, poses[:, 1] / resolution_m - 0.5
+    columns = np.stack([c, -s, x0], axis=1).astype(np.float32) @ xy1
+    rows = np.stack([s, c, y0], axis=1).astype(np.float32) @ xy1
+    return columns, rows
+
+
+def scores(
+    field: NDArray[np.uint8], resolution_m: float, probe: Probe, poses: Poses, worth: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """(C,) metres of wall for, less metres against, of every transform."""
+    points = probe.xy1.shape[1]
+    if not points or not len(poses):
+        return np.zeros(len(poses), np.float32)
+    step = max(1, min(32_000, _BLOCK // points))
+    blocks = [poses[i : i + step] for i in range(0, len(poses), step)]
+    sums = [worth.take(readings(field, resolution_m, probe, block)).sum(axis=1) for block in blocks]
+    return np.concatenate(sums) * np.float32(probe.wall_m)
