@@ -1,0 +1,95 @@
+"""Where a scan fits: Gauss-Newton on the likelihood field, for one pose or for all particles at once.
+
+Minimises  sum_i (1 - L(T p_i))^2  +  (x - prior)' W (x - prior)   over the pose x = (x, y, theta); L is the field, W
+what odometry knows.  The sum's curvature H says what the walls determine: where its weakest eigenvalue is a small part
+of the strongest, the geometry leaves that direction open (a corridor) and the prior decides.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.mapping.likelihood import TiledFields
+
+ITERATIONS = 4
+MAX_STEP = np.array([0.15, 0.15, 0.1])  # metres, metres, radians: a wilder step has left the basin
+ARM_M = 5.0  # a radian counts as this many metres when directions are compared
+UNCONSTRAINED_RATIO = 0.02  # weakest to strongest curvature; a bare corridor with a few door frames has about 0.01
+
+Poses = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """How (P,) poses fit, each in its particle's field."""
+
+    poses: Poses  # (P, 3) x, y, theta
+    likelihood: NDArray[np.float32]  # (P, M) field value under every point
+    curvature: NDArray[np.float64]  # (P, 3, 3) of the walls alone
+
+    def fractions(self) -> NDArray[np.float64]:
+        """(P,) mean field value: 1 when every point lies on a mapped wall."""
+        return np.asarray(self.likelihood.mean(axis=1, dtype=np.float64))
+
+
+def refine(
+    fields: TiledFields,
+    particles: NDArray[np.int64],
+    poses: Poses,
+    priors: Poses,
+    weights: NDArray[np.float64],
+    points_m: NDArray[np.float32],
+    iterations: int = ITERATIONS,
+) -> Fit:
+    """Gauss-Newton from (P, 3) poses, each held by its prior with information (P, 3, 3), in the fields of (P,) particles."""
+    poses = poses.copy()
+    for _ in range(iterations):
+        value, jacobian = linearised(fields, particles, poses, points_m)
+        curvature = np.einsum("pim,pjm->pij", jacobian, jacobian).astype(np.float64)
+        pull = np.einsum("pim,pm->pi", jacobian, 1.0 - value).astype(np.float64)
+        pull += np.einsum("pij,pj->pi", weights, difference(priors, poses))
+        step = np.linalg.solve(curvature + weights, pull[:, :, None])[:, :, 0]
+        poses += np.clip(step, -MAX_STEP, MAX_STEP)
+    value, jacobian = linearised(fields, particles, poses, points_m)
+    return Fit(poses, value, np.einsum("pim,pjm->pij", jacobian, jacobian).astype(np.float64))
+
+
+def linearised(
+    fields: TiledFields, particles: NDArray[np.int64], poses: Poses, points_m: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Field value (P, M) under every point and its derivative (P, 3, M) by the pose."""
+    x, y, arm_x, arm_y = placed(poses, points_m)
+    value, slope_x, slope_y = fields.look_up(particles, x, y)
+    return value, np.stack([slope_x, slope_y, slope_y * arm_x - slope_x * arm_y], axis=1)
+
+
+def placed(poses: Poses, points_m: NDArray[np.float32]) -> tuple[NDArray[np.float32], ...]:
+    """(P, M) map x and y of (M, 2) robot points under (P, 3) poses, and both relative to the robot."""
+    cos = np.cos(poses[:, 2:]).astype(np.float32)
+    sin = np.sin(poses[:, 2:]).astype(np.float32)
+    arm_x = cos * points_m[:, 0] - sin * points_m[:, 1]
+    arm_y = sin * points_m[:, 0] + cos * points_m[:, 1]
+    return arm_x + poses[:, :1].astype(np.float32), arm_y + poses[:, 1:2].astype(np.float32), arm_x, arm_y
+
+
+def difference(a: Poses, b: Poses) -> Poses:
+    """a - b, angles wrapped."""
+    d = a - b
+    d[..., 2] = (d[..., 2] + np.pi) % (2.0 * np.pi) - np.pi
+    return d
+
+
+def information(deviation_m: float, deviation_rad: float) -> NDArray[np.float64]:
+    """(3, 3) inverse covariance of a round prior."""
+    return np.diag([deviation_m**-2, deviation_m**-2, deviation_rad**-2])
+
+
+def weakest_direction(curvature: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+    """Ratio of the weakest to the strongest curvature of a (3, 3), turns counted at ARM_M, and the weak direction."""
+    scale = np.array([1.0, 1.0, 1.0 / ARM_M])
+    values, vectors = np.linalg.eigh(curvature * np.outer(scale, scale))
+    ratio = float(max(values[0], 0.0) / values[2]) if values[2] > 0 else 0.0
+    return ratio, vectors[:, 0]

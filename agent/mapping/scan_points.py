@@ -1,0 +1,76 @@
+"""A revolution of the LIDAR as points in the robot frame, as if measured in one moment.
+
+Angles and times are per beam, so a spinning LIDAR may report another number of points each turn, and what it saw while
+the robot turned is put where it belongs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.mapping.motion import OdometryTrack, undo_motion
+from agent.mapping.options import MappingOptions
+from hw.readings import LaserScan
+from protocol.geometry import SE2
+
+VOXEL_M = 0.05  # one point a voxel for matching: a near wall must not outvote the rest of the room
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanPoints:
+    """End points of the beams that returned, in the robot frame at `stamp_s`."""
+
+    stamp_s: float
+    points_m: NDArray[np.float32]  # (N, 2) every return, cut rays included
+    is_hit: NDArray[np.bool_]  # (N,) False: the ray was cut at the matching range, something lies further on
+    matching_m: NDArray[np.float32]  # (M, 2) hits, one a voxel
+    is_partial: bool
+
+    @property
+    def n(self) -> int:
+        return len(self.points_m)
+
+
+def reference_stamp_s(scan: LaserScan) -> float:
+    """The moment a scan speaks for: the middle of its revolution."""
+    return scan.stamp_s + 0.5 * scan.duration_s
+
+
+def scan_points(scan: LaserScan, track: OdometryTrack, options: MappingOptions) -> ScanPoints:
+    """Every beam's end point, motion within the revolution undone."""
+    ranges = np.asarray(scan.ranges_m, np.float64)
+    is_return = np.isfinite(ranges) & (ranges >= max(scan.range_min_m, 1e-3)) & (ranges < scan.range_max_m)
+    cut = np.minimum(ranges[is_return], options.matching_range_m)
+    angles = np.asarray(scan.angles_rad, np.float64)[is_return]
+    points_laser = np.stack([cut * np.cos(angles), cut * np.sin(angles)], axis=1)
+    points = options.T_base_laser.apply(points_laser)
+    stamp_s = reference_stamp_s(scan)
+    reference = track.pose_at(stamp_s)
+    if scan.duration_s > 0.0 and reference is not None and len(points):
+        points = undo_motion(points, track.poses_at(beam_stamps_s(scan)[is_return]), reference)
+    is_hit = ranges[is_return] < options.matching_range_m
+    ends = points.astype(np.float32)
+    return ScanPoints(stamp_s, ends, is_hit, one_per_voxel(ends[is_hit]), scan.is_partial)
+
+
+def beam_stamps_s(scan: LaserScan) -> NDArray[np.float64]:
+    """(N,) when each beam was measured."""
+    if scan.time_offsets_s is not None:
+        return scan.stamp_s + np.asarray(scan.time_offsets_s, np.float64)
+    return scan.stamp_s + np.linspace(0.0, scan.duration_s, len(scan.ranges_m))
+
+
+def one_per_voxel(points_m: NDArray[np.float32], voxel_m: float = VOXEL_M) -> NDArray[np.float32]:
+    """The first point of every voxel, in beam order."""
+    keys = np.floor(points_m / voxel_m).astype(np.int64)
+    _, first = np.unique(keys[:, 0] * 1_000_003 + keys[:, 1], return_index=True)
+    return points_m[np.sort(first)]
+
+
+def laser_position_m(options: MappingOptions, T_map_robot: SE2) -> tuple[float, float]:
+    """Where the LIDAR stands in the map frame."""
+    T_map_laser = T_map_robot @ options.T_base_laser
+    return T_map_laser.x_m, T_map_laser.y_m

@@ -1,0 +1,80 @@
+"""The front end: where the robot is now, matched against the best particle's field on every scan.
+
+Cheap while all goes well (Gauss-Newton from the odometry prediction); after a large step, or when the match is poor, it
+first asks the coarse field for better places to start from.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.mapping.correlation import CoarseField
+from agent.mapping.likelihood import TiledFields
+from agent.mapping.scan_matching import Poses, information, refine, weakest_direction
+
+GOOD_FRACTION = 0.55  # mean field value of a match that needs no second look
+SMALL_STEP_M = 0.15  # below this, odometry lies in the basin of Gauss-Newton
+SMALL_STEP_RAD = math.radians(5)
+NEAR_REACH = (0.3, math.radians(12))  # search window after a large step
+WIDE_REACH = (0.8, math.radians(30))  # when the near window found nothing good
+STARTS = 4  # coarse peaks that Gauss-Newton is started from
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracked:
+    """The pose that fits, and how well."""
+
+    pose: NDArray[np.float64]  # (3,) T_map_robot
+    fraction: float  # mean field value under the scan, 0 to 1
+    curvature: NDArray[np.float64]  # (3, 3) of the walls alone
+    weakest: float  # ratio of weakest to strongest direction
+
+
+def track(
+    fields: TiledFields,
+    particle: int,
+    coarse: CoarseField,
+    predicted: NDArray[np.float64],
+    step: tuple[float, float],
+    deviation: tuple[float, float],
+    points_m: NDArray[np.float32],
+) -> Tracked:
+    """The pose near `predicted` that fits best; `step` is how far the robot moved (metres, radians), `deviation` one sigma."""
+    weights = information(*deviation)
+    reach_m = float(np.hypot(*points_m.T).max()) + 2.0
+    fields.cover(predicted[:2] - reach_m, predicted[:2] + reach_m)
+    starts = predicted[None]
+    best = best_fit(fields, particle, starts, predicted, weights, points_m)
+    is_small = step[0] < SMALL_STEP_M and step[1] < SMALL_STEP_RAD
+    for reach in (NEAR_REACH, WIDE_REACH):
+        if best.fraction >= GOOD_FRACTION and (is_small or reach is WIDE_REACH):
+            break
+        starts, _ = coarse.best_poses(predicted, points_m, *reach, STARTS)
+        best = better(best, best_fit(fields, particle, starts, predicted, weights, points_m))
+    return best
+
+
+def better(a: Tracked, b: Tracked) -> Tracked:
+    return b if b.fraction > a.fraction + 0.01 else a
+
+
+def best_fit(
+    fields: TiledFields,
+    particle: int,
+    starts: Poses,
+    predicted: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    points_m: NDArray[np.float32],
+) -> Tracked:
+    """Gauss-Newton from every start; the best end."""
+    n = len(starts)
+    priors = np.broadcast_to(predicted, (n, 3))
+    fit = refine(fields, np.full(n, particle), starts, priors, np.broadcast_to(weights, (n, 3, 3)), points_m)
+    fractions = fit.fractions()
+    i = int(np.argmax(fractions))
+    ratio, _ = weakest_direction(fit.curvature[i])
+    return Tracked(fit.poses[i], float(fractions[i]), fit.curvature[i], ratio)
