@@ -12,9 +12,10 @@ from typing import Protocol
 
 from hw.driver import Driver, Reading
 from hw.errors import DeviceConfigError
+from hw.health import DeviceHealth, DeviceState
 from hw.lidars import LIDARS
 from hw.port import SerialPort
-from hw.supervisor import Device, DeviceHealth, DeviceState
+from hw.supervisor import Device
 from hw.urls import DeviceUrl, parse_url
 from hw.wheel_driver import BASES
 

@@ -74,7 +74,7 @@ class SetBaud:
 
 
 Step = Send | Ask | Drain | Pause | SetLines | SetBaud
-Script = Generator[Step, Any, None]
+Script = Generator[Step, Any, Any]  # a script may hand a value to the one that called it
 
 
 @dataclass(slots=True)

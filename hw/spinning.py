@@ -51,6 +51,10 @@ class SpinningLidar(DriverBase):
         self._assembler.restart()
         self._drop_held()
 
+    def feed(self, data: bytes, now_s: float) -> list[Reading]:
+        """See `Driver.feed`."""
+        raise NotImplementedError
+
     def _drop_held(self) -> None:
         self._held.clear()
         self._held_arrivals_s.clear()

@@ -10,65 +10,31 @@ fault never leaves `read()` as an exception: it is None, and `health()` says why
 
 from __future__ import annotations
 
+import os
 import random
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from enum import Enum
+from dataclasses import replace
 from typing import Any
 
 from hw.driver import Ask, Drain, Driver, Pause, Reading, Script, Send, SetBaud, SetLines
 from hw.errors import DeviceAbsent, DeviceError, DeviceGarbled, DeviceSilent
-from hw.framing import Counters
+from hw.health import DeviceHealth, DeviceState, RateMeter, StreamJudge
 from hw.port import Port
 from hw.readings import LaserScan, Odometry
 
 FIRST_BACK_OFF_S, LAST_BACK_OFF_S = 0.05, 2.0  # a replugged cable is back within a second; a missing one costs nothing
+SILENT_BACK_OFF_S = 0.4  # the port is there, the device says nothing: it may speak again any moment
 READ_WAIT_S = 0.05
-MIN_STALL_S, STALL_PERIODS = 0.3, 3.0  # HARDWARE.md: noticed within half a second at 10 Hz
+GATHER_S = 0.01  # bytes are fetched in portions: at 375 packets a second, waking for each costs more than decoding it
+MIN_STALL_S, STALL_PERIODS = 0.3, 3.0  # HARDWARE.md: noticed within half a second
 PROBE_S = 0.6  # how long a rate is listened to before the next one is tried
+PROBE_BYTES = 4096  # no valid frame among so many: the rate or the device is another one
 FIRST_READING_S = 5.0  # a motor needs 1-2 s to spin up
+TRY_OTHERS_EVERY = 5  # a device that once answered at a rate is sought at the others only now and then
 SCAN_SLOTS, ODOMETRY_SLOTS = 2, 512  # newest wins: an old scan is worth nothing, old odometry is cheap
-
-
-class DeviceState(Enum):
-    """Where a device stands."""
-
-    DISCONNECTED = "disconnected"
-    PROBING = "probing"
-    STARTING = "starting"
-    RUNNING = "running"
-    DEGRADED = "degraded"
-
-
-@dataclass(frozen=True, slots=True)
-class DeviceHealth:
-    """All there is to say about a device, for `status`, `doctor` and the log."""
-
-    url: str
-    state: DeviceState
-    port: str = ""
-    baud: int = 0
-    model: str = ""
-    serial: str = ""
-    firmware: str = ""
-    uptime_s: float = 0.0  # since the stream last started
-    age_s: float = float("inf")  # of the newest reading
-    rate_hz: float = 0.0
-    points: int = 0  # of the newest scan
-    coverage: float = 0.0  # of the newest scan, 0..1
-    bytes_per_s: float = 0.0
-    readings: int = 0
-    bad_frames: int = 0
-    skipped_bytes: int = 0
-    rejected: int = 0
-    resyncs: int = 0
-    stalls: int = 0
-    reconnects: int = 0
-    dropped: int = 0  # readings nobody fetched in time
-    last_error: str = ""  # what went wrong last, and what to try
 
 
 OpenPort = Callable[[int, bool | None], Port]  # (baud, level of DTR while opening)
@@ -97,7 +63,11 @@ class Device:
         self._health = DeviceHealth(url, DeviceState.DISCONNECTED, port_name)
         self._running_since_s = self._last_reading_s = 0.0
         self._stamps: deque[float] = deque(maxlen=20)
-        self._rates = _RateMeter()
+        self._rates = RateMeter()
+        self._last_bytes_s = 0.0
+        self._good_baud = 0  # the rate at which the device last ran
+        self._attempts = 0  # since then
+        self._is_gone = False  # the port failed: nothing can be written any more
 
     def start(self) -> Device:
         """Begin; returns at once, the device comes up in the background."""
@@ -159,113 +129,135 @@ class Device:
         back_off_s = FIRST_BACK_OFF_S
         while not self._stopping.is_set():
             before = self._health.readings
+            most_s = LAST_BACK_OFF_S
             try:
                 self._session()
             except DeviceError as error:
-                self._note(state=DeviceState.DISCONNECTED, last_error=str(error))
+                most_s = SILENT_BACK_OFF_S if isinstance(error, DeviceSilent) else LAST_BACK_OFF_S
+                self._failed(str(error))
             except Exception as error:  # a bug of ours must not silence a robot's eyes
-                self._note(
-                    state=DeviceState.DISCONNECTED, last_error=f"{self._url}: internal error {error!r}; please report this"
-                )
+                self._failed(f"internal error {error!r}; please report this")
             finally:
                 self._close()
             if self._health.readings > before:
                 back_off_s = FIRST_BACK_OFF_S
-            self._stopping.wait(back_off_s * self._rng.uniform(0.8, 1.2))
+            self._wait_to_retry(min(back_off_s, most_s) * self._rng.uniform(0.8, 1.2))
             back_off_s = min(2 * back_off_s, LAST_BACK_OFF_S)
             self._note(reconnects=self._health.reconnects + (not self._stopping.is_set()))
         self._note(state=DeviceState.DISCONNECTED)
 
+    def _failed(self, why: str) -> None:
+        self._note(state=DeviceState.DISCONNECTED, last_error=why if why.startswith(self._url) else f"{self._url}: {why}")
+
+    def _wait_to_retry(self, seconds: float) -> None:
+        """Wait; not longer than until a port that was missing is there again."""
+        path = self._health.port
+        was_missing = path.startswith("/") and not os.path.exists(path)
+        deadline_s = time.monotonic() + seconds
+        while (left_s := deadline_s - time.monotonic()) > 0 and not self._stopping.is_set():
+            if was_missing and os.path.exists(path):
+                return
+            self._stopping.wait(min(left_s, READ_WAIT_S))
+
     def _session(self) -> None:
         """From opening the port to losing the device; returns only when stopped, else raises."""
         driver = self._driver
-        self._port = port = self._open_port(driver.bauds[0], driver.open_dtr)
+        self._is_gone = False
+        self._port = self._open_port(self._good_baud or driver.bauds[0], driver.open_dtr)
         try:
-            self._bring_up(port)
-            self._stream(port)
+            self._bring_up(self._port)
+            self._stream(self._port)
         finally:
             if not self._is_gone:
                 self._quietly(driver.stop())
 
     def _bring_up(self, port: Port) -> None:
         """Try each rate until the device answers its start script and sends a first good frame."""
+        self._attempts += 1
+        bauds = [self._good_baud] if self._good_baud and self._attempts % TRY_OTHERS_EVERY else list(self._driver.bauds)
         problems: list[DeviceError] = []
-        self._is_gone = False
-        for baud in self._driver.bauds:
-            self._note(state=DeviceState.PROBING, baud=baud)
+        for baud in bauds:
+            if self._stopping.is_set():
+                return
+            self._note(state=DeviceState.PROBING)
             self._set_baud(baud)
             port.flush_input()
             self._driver.restart()
             try:
+                frames = self._driver.counters.frames
                 self._perform(self._driver.start())
-                self._first_frame()
+                self._first_frame(frames, PROBE_S if len(bauds) > 1 else FIRST_READING_S)
             except (DeviceSilent, DeviceGarbled) as error:
                 problems.append(error)
                 continue
+            self._good_baud, self._attempts = baud, 0
             return
         if problems:
-            garbled = [p for p in problems if isinstance(p, DeviceGarbled)]
-            raise (garbled or problems)[0]
+            raise next((p for p in problems if isinstance(p, DeviceGarbled)), problems[0])
 
-    def _first_frame(self) -> None:
+    def _first_frame(self, frames: int, listen_s: float) -> None:
         """Wait for a first good frame at this rate; say what was seen instead."""
         counters = self._driver.counters
-        frames, seen = counters.frames, counters.bytes_in
-        begin_s = time.monotonic()
-        deadline_s = begin_s + (PROBE_S if len(self._driver.bauds) > 1 else FIRST_READING_S)
+        seen, begin_s = counters.bytes_in, time.monotonic()
         self._note(state=DeviceState.STARTING)
-        while counters.frames == frames:
-            if self._stopping.is_set():
-                return
-            now_s = time.monotonic()
-            n = counters.bytes_in - seen
-            if now_s > deadline_s and (n == 0 or now_s > begin_s + FIRST_READING_S or n > 4096):
+        while counters.frames == frames and not self._stopping.is_set():
+            n, waited_s = counters.bytes_in - seen, time.monotonic() - begin_s
+            if n > PROBE_BYTES or waited_s > (FIRST_READING_S if n else listen_s):
                 self._raise_no_frame(n)
             self._pump(READ_WAIT_S)
 
     def _raise_no_frame(self, n_bytes: int) -> None:
-        rates = "/".join(map(str, self._driver.bauds))
         if n_bytes == 0:
             raise DeviceSilent(f"{self._url}: nothing comes at {self._health.baud} baud; is it powered, and does the motor turn?")
+        rates = " or ".join(map(str, self._driver.bauds))
         raise DeviceGarbled(
             f"{self._url}: {n_bytes} bytes, no valid frame; is the baud rate {rates}, and is this really that device?"
         )
 
     def _stream(self, port: Port) -> None:
         """Feed the driver until stopped; restart a stalled stream once, then give up the session."""
-        self._running_since_s = self._last_reading_s = time.monotonic()
-        has_run, restarts, next_poll_s = False, 0, 0.0
-        judge = _StreamJudge(self._driver.counters)
+        now_s = time.monotonic()
+        self._running_since_s = self._last_reading_s = self._last_bytes_s = now_s
+        has_run, restarts, next_poll_s = False, 0, now_s
+        judge = StreamJudge(self._driver.counters)
         while not self._stopping.is_set():
-            now_s = time.monotonic()
-            if self._driver.poll_period_s is not None and now_s >= next_poll_s:
-                port.write(self._driver.poll())
-                next_poll_s = now_s + self._driver.poll_period_s
-            wait_s = READ_WAIT_S if self._driver.poll_period_s is None else min(READ_WAIT_S, self._driver.poll_period_s)
+            wait_s = READ_WAIT_S
+            if self._driver.poll_period_s is not None:
+                wait_s = min(wait_s, self._driver.poll_period_s)
+                if now_s >= next_poll_s:
+                    port.write(self._driver.poll())
+                    next_poll_s = max(next_poll_s + self._driver.poll_period_s, now_s)
             n = self._pump(wait_s)
             now_s = time.monotonic()
             if n:
                 has_run, restarts = True, 0
-                self._note(
-                    state=judge.state(now_s, self._health.coverage), last_error=judge.error(self._url) or self._health.last_error
-                )
-                continue
-            limit_s = self._stall_limit_s() if has_run else FIRST_READING_S
-            if now_s - self._last_reading_s > limit_s:
-                self._stalled(restarts)
+                self._judge(judge, now_s)
+            elif self._is_stalled(now_s, has_run):
+                self._restart_stalled(restarts)
                 restarts += 1
-                self._last_reading_s = now_s
+                self._last_reading_s = self._last_bytes_s = now_s = time.monotonic()
 
-    def _stall_limit_s(self) -> float:
-        return max(MIN_STALL_S, STALL_PERIODS * self._driver.period_s)
+    def _is_stalled(self, now_s: float, has_run: bool) -> bool:
+        """No byte for 0.3 s, or bytes but no reading for three periods."""
+        if not has_run:
+            return now_s - self._last_reading_s > FIRST_READING_S
+        limit_s = max(MIN_STALL_S, STALL_PERIODS * self._driver.period_s)
+        return now_s - self._last_bytes_s > MIN_STALL_S or now_s - self._last_reading_s > limit_s
 
-    def _stalled(self, restarts: int) -> None:
-        message = f"{self._url}: no reading for {self._stall_limit_s():.1f} s; is the motor blocked, or the cable loose?"
+    def _restart_stalled(self, restarts: int) -> None:
+        """The stream stood still: start it again, the second time by opening the port anew."""
+        message = f"{self._url}: the stream stands still; is the motor blocked, or the cable loose?"
         self._note(stalls=self._health.stalls + 1, state=DeviceState.STARTING, last_error=message)
         if restarts > 0:
             raise DeviceSilent(message)
         self._driver.restart()
         self._perform(self._driver.start())
+
+    def _judge(self, judge: StreamJudge, now_s: float) -> None:
+        state = judge.state(now_s, self._health.coverage)
+        error = judge.error(self._url)
+        if state is not self._health.state or (error and error != self._health.last_error):
+            self._note(state=state, last_error=error or self._health.last_error)
 
     def _perform(self, script: Script) -> None:
         """Carry out a driver's script, step by step."""
@@ -317,6 +309,9 @@ class Device:
     def _pump(self, wait_s: float) -> int:
         """Move what has come to the driver and its readings to the reader; how many readings there were."""
         assert self._port is not None
+        gather_s = self._last_bytes_s + GATHER_S - time.monotonic()
+        if gather_s > 0:
+            time.sleep(gather_s)
         try:
             data = self._port.read(wait_s)
         except DeviceAbsent:
@@ -324,7 +319,7 @@ class Device:
             raise
         if not data:
             return 0
-        now_s = time.monotonic()
+        self._last_bytes_s = now_s = time.monotonic()
         if self._tap is not None:
             self._tap(now_s, data)
         self._rates.add(now_s, len(data))
@@ -386,49 +381,3 @@ class Device:
     def _note(self, **facts: Any) -> None:
         with self._arrived:
             self._health = replace(self._health, **facts)
-
-    _is_gone = False
-
-
-class _RateMeter:
-    """Bytes a second over the last two seconds."""
-
-    def __init__(self) -> None:
-        self._slots: deque[tuple[float, int]] = deque(maxlen=400)
-        self._lock = threading.Lock()
-
-    def add(self, now_s: float, n: int) -> None:
-        with self._lock:
-            self._slots.append((now_s, n))
-
-    def bytes_per_s(self, now_s: float) -> float:
-        with self._lock:
-            recent = [(s, n) for s, n in self._slots if now_s - s < 2.0]
-        if not recent:
-            return 0.0
-        return sum(n for _, n in recent) / max(0.1, now_s - recent[0][0])
-
-
-class _StreamJudge:
-    """RUNNING or DEGRADED: more than 1 % of the frames bad within a second, or a scan with less than 95 % of its circle."""
-
-    def __init__(self, counters: Counters) -> None:
-        self._counters = counters
-        self._since_s = 0.0
-        self._frames = self._bad = 0
-        self._bad_share = 0.0
-
-    def state(self, now_s: float, coverage: float) -> DeviceState:
-        if now_s - self._since_s > 1.0:
-            c = self._counters
-            bad, frames = c.bad_frames + c.rejected, c.frames
-            new_bad, new_frames = bad - self._bad, frames - self._frames
-            self._bad_share = new_bad / max(1, new_bad + new_frames) if self._since_s else 0.0
-            self._since_s, self._bad, self._frames = now_s, bad, frames
-        is_fine = self._bad_share <= 0.01 and (coverage == 0.0 or coverage >= 0.95)
-        return DeviceState.RUNNING if is_fine else DeviceState.DEGRADED
-
-    def error(self, url: str) -> str:
-        if self._bad_share <= 0.01:
-            return ""
-        return f"{url}: {self._bad_share:.0%} of the frames are damaged; a shorter cable, or another power supply?"
