@@ -46,7 +46,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_config_arguments(parser)
     parser.add_argument("--ready-json", action="store_true", help="print one JSON line with addresses once the robot is up")
     parser.add_argument("--no-state", action="store_true", help="keep nothing on disk")
-    parser.add_argument("--die-with-parent", action="store_true", help="stop when the process that started this one is gone")
+    parser.add_argument(
+        "--die-with-parent", type=int, metavar="PID", help="stop when the process PID, which started this one, ends"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -55,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
         config = replace(config, log=replace(config.log, level="warning" if args.quiet else "debug"))
     set_up_logging(config.log.level, config.robot.id)
     if args.die_with_parent:
-        die_with_parent()
+        die_with_parent(args.die_with_parent)
     cv2.setNumThreads(1)  # one core is for mapping; OpenCV's own threads only get in its way
     stopping = StopSignals()
     node = make_node(with_devices(config), keeps_state=not args.no_state)
@@ -83,9 +85,8 @@ def with_devices(config: Config) -> Config:
 
 def make_node(config: Config, *, keeps_state: bool) -> Node:
     folder = state_dir(config, os.environ) if keeps_state else None
-    socket = control_socket(config.robot.id, os.environ) if keeps_state else None
     try:
-        return Node(config, folder, socket)
+        return Node(config, folder, control_socket(config.robot.id, os.environ))
     except (DeviceConfigError, NetworkConfigError) as error:
         raise CommandError(str(error), USAGE) from error
 
@@ -173,9 +174,8 @@ def exit_watchdog(stopping: threading.Event) -> Any:
         done.set()
 
 
-def die_with_parent() -> None:
+def die_with_parent(parent: int) -> None:
     """The kernel ends this process when its parent ends, however that happens."""
-    parent = os.getppid()
     ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
-    if os.getppid() != parent or parent == 1:
+    if os.getppid() != parent:
         raise CommandError("the process that started this robot is gone", ENVIRONMENT)

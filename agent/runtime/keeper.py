@@ -6,6 +6,7 @@ session is opened anew, with the configured seeds and the addresses learnt since
 
 from __future__ import annotations
 
+import base64
 import json
 import logging
 import threading
@@ -17,7 +18,9 @@ from agent.fleet.state import Presence
 from agent.runtime import snapshot as snapshots
 from agent.runtime.control import ControlError, Handler
 from agent.runtime.latest import Latest
+from protocol.geometry import SE2
 from protocol.grid import OccupancyGrid
+from protocol.tiles import pack_cells, unpack_cells
 
 if TYPE_CHECKING:
     from agent.runtime.node import Node
@@ -97,6 +100,7 @@ class Keeper:
             "unmerge": lambda request: self._order("unmerge", request),
             "readmit": lambda request: self._order("readmit", request),
             "save": lambda _: self._save(),
+            "map": self._map,
             "stop": lambda _: self._stop(),
         }
 
@@ -128,6 +132,14 @@ class Keeper:
             raise ControlError(f"not saved: {node.state.last_error}")
         return {"message": f"saved {len(checkpoint)} bytes in {node.state.folder}"}
 
+    def _map(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
+        """The cells of a map: "global", our own, or a peer's; see `unpacked_map`."""
+        found = self.grid(str(request.get("name", snapshots.GLOBAL)))
+        if found is None:
+            raise ControlError(f"no map {request.get('name')!r}; there are {', '.join(snapshots.maps(self._node)) or 'none yet'}")
+        version, grid = found
+        return {"map": packed_map(version, grid)}
+
     def _stop(self) -> Mapping[str, Any]:
         self._node.stopping.set()
         return {"message": "stopping"}
@@ -149,6 +161,23 @@ class Keeper:
         """One line for the service manager."""
         mapping, group = snapshots.mapping(self._node), len(self._node.fleet.state().frames)
         return f"{mapping['scans']} scans, {mapping.get('known_m2', 0)} m2, group of {max(1, group)}"
+
+
+def packed_map(version: str, grid: OccupancyGrid) -> dict[str, Any]:
+    """A map as JSON values."""
+    return {
+        "version": version,
+        "height": grid.height,
+        "width": grid.width,
+        "resolution_m": grid.resolution_m,
+        "origin": [grid.origin.x_m, grid.origin.y_m, grid.origin.theta_rad],
+        "cells": base64.b64encode(pack_cells(grid.cells)).decode(),
+    }
+
+
+def unpacked_map(packed: Mapping[str, Any]) -> OccupancyGrid:
+    cells = unpack_cells(base64.b64decode(packed["cells"]), packed["height"], packed["width"])
+    return OccupancyGrid(cells, packed["resolution_m"], SE2(*packed["origin"]))
 
 
 def facts(status: Mapping[str, Any]) -> dict[str, str]:
