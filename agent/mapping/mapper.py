@@ -82,7 +82,7 @@ class Mapper:
         return self._outcome(status, is_keyframe, tracked.fraction, "")
 
     def _first_scan(self, points: ScanPoints) -> ScanOutcome:
-        self.filter.start(points.matching_m)
+        self.filter.start(points.surface_m)
         self._draw(points)
         self.last_scan_s = self.keyframe_s = points.stamp_s
         self._note_pose(points.stamp_s)
@@ -114,7 +114,7 @@ class Mapper:
         """Algorithm of particle_filter.py, then the grid of the best particle."""
         motion = as_array(as_pose(self.keyframe_pose).inverse() @ as_pose(self.pose))
         deviation_m, deviation_rad = np.sqrt(self.keyframe_deviation)
-        self.filter.update(motion, float(deviation_m), float(deviation_rad), points.matching_m)
+        self.filter.update(motion, (float(deviation_m), float(deviation_rad)), points.matching_m, points.surface_m)
         self.best = self.filter.best()
         self.pose = self.filter.poses[self.best].copy()
         self.keyframe_s = points.stamp_s

@@ -54,29 +54,31 @@ class ParticleFilter:
         weights = np.exp(self.log_weights - self.log_weights.max())
         return np.asarray(weights / weights.sum())
 
-    def start(self, points_m: NDArray[np.float32]) -> None:
+    def start(self, surface_m: NDArray[np.float32]) -> None:
         """The first keyframe: every particle stands at its pose and draws the same scan."""
-        self._cover(points_m)
-        self.fields = self._stamped_once(points_m)
+        self._cover(surface_m)
+        self._stamp(surface_m)
         self._remember()
 
-    def _stamped_once(self, points_m: NDArray[np.float32]) -> TiledFields:
-        self._stamp(points_m)
-        return self.fields
-
-    def update(self, motions: Poses, deviation_m: float, deviation_rad: float, points_m: NDArray[np.float32]) -> Fit:
-        """One keyframe: `motions` (3,) in the robot frame since the last one, its one-sigma, and the points to match."""
-        predicted = moved(self.poses, motions)
+    def update(
+        self,
+        motion: NDArray[np.float64],
+        deviation: tuple[float, float],
+        points_m: NDArray[np.float32],
+        surface_m: NDArray[np.float32],
+    ) -> Fit:
+        """One keyframe: motion (3,) in the robot frame since the last one, one sigma of it, points to match and to draw."""
+        predicted = moved(self.poses, motion)
         noise = self.rng.standard_normal((self.particles, 3)) * PREDICTION_NOISE
         noise[0] = 0.0  # one particle follows the tracked motion exactly
         self.poses = predicted + noise
         self._cover(points_m)
         everyone = np.arange(self.particles)
-        prior = np.broadcast_to(information(deviation_m, deviation_rad), (self.particles, 3, 3))
+        prior = np.broadcast_to(information(*deviation), (self.particles, 3, 3))
         fit = refine(self.fields, everyone, self.poses, predicted, prior, points_m)
         self.poses = fit.poses + self._spread(fit, prior)
         self._weigh(fit)
-        self._stamp(points_m)
+        self._stamp(surface_m)
         self._remember()
         self._resample_when_needed()
         return fit

@@ -17,6 +17,8 @@ from hw.readings import LaserScan
 from protocol.geometry import SE2
 
 VOXEL_M = 0.05  # one point a voxel for matching: a near wall must not outvote the rest of the room
+WIDEST_GAP_M = 0.4  # two neighbouring hits farther apart may be two things
+STEEPEST = 0.85  # change of range per gap: beyond it the surface is seen so flat that it may be a depth jump
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,6 +29,7 @@ class ScanPoints:
     points_m: NDArray[np.float32]  # (N, 2) every return, cut rays included
     is_hit: NDArray[np.bool_]  # (N,) False: the ray was cut at the matching range, something lies further on
     matching_m: NDArray[np.float32]  # (M, 2) hits, one a voxel
+    surface_m: NDArray[np.float32]  # (K, 2) hits and the surfaces between neighbouring ones, one a voxel
     is_partial: bool
 
     @property
@@ -53,7 +56,21 @@ def scan_points(scan: LaserScan, track: OdometryTrack, options: MappingOptions) 
         points = undo_motion(points, track.poses_at(beam_stamps_s(scan)[is_return]), reference)
     is_hit = ranges[is_return] < options.matching_range_m
     ends = points.astype(np.float32)
-    return ScanPoints(stamp_s, ends, is_hit, one_per_voxel(ends[is_hit]), scan.is_partial)
+    hits = one_per_voxel(ends[is_hit])
+    return ScanPoints(stamp_s, ends, is_hit, hits, one_per_voxel(np.vstack([hits, between(ends, is_hit, cut)])), scan.is_partial)
+
+
+def between(ends_m: NDArray[np.float32], is_hit: NDArray[np.bool_], ranges_m: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Points on the straight surface between neighbouring hits, a voxel apart.
+
+    Without them a field of sparse beams is a row of dots, and the next scan's dots slide into them.
+    """
+    gap_m = np.hypot(*(ends_m[1:] - ends_m[:-1]).T)
+    is_surface = is_hit[1:] & is_hit[:-1] & (gap_m < WIDEST_GAP_M) & (np.abs(np.diff(ranges_m)) < STEEPEST * gap_m)
+    inner = np.where(is_surface, np.ceil(gap_m / VOXEL_M) - 1, 0).astype(np.int64)
+    first = np.repeat(np.arange(len(gap_m)), inner)
+    share = (np.arange(len(first)) - np.repeat(np.cumsum(inner) - inner, inner) + 1) / (inner[first] + 1)
+    return (ends_m[first] + share[:, None].astype(np.float32) * (ends_m[first + 1] - ends_m[first])).astype(np.float32)
 
 
 def beam_stamps_s(scan: LaserScan) -> NDArray[np.float64]:
