@@ -217,7 +217,7 @@ class Exchange:
         key = str(query.key_expr)
         content = None if "*" in key else self._answer(key)
         if content is not None and len(content) <= MAX_PAYLOAD_BYTES:
-            query.reply(key, content, congestion_control=zenoh.CongestionControl.DROP)
+            query.reply(key, content)  # as droppable as the query it answers
             self.traffic.served_bytes += len(content)
 
     # Asking.
