@@ -200,7 +200,7 @@ def _pack_table(table: NDArray[np.float32], columns: tuple[tuple[str, float], ..
         steps = np.rint(table[:, i].astype(np.float64) / quantum)
         limits = np.iinfo(dtype)
         wrapped = steps % 65_536 if (dtype, quantum) == _ANGLE else np.clip(np.nan_to_num(steps), limits.min, limits.max)
-        parts.append(wrapped.astype(dtype).view(np.uint8).reshape(len(table), -1).T.tobytes())
+        parts.append(wrapped.astype(dtype).view(np.uint8).reshape(len(table), np.dtype(dtype).itemsize).T.tobytes())
     return b"".join(parts)
 
 

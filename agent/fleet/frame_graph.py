@@ -55,7 +55,7 @@ class Group:
         T_new_old = self.T_root[root].inverse()
         frames = {robot: T_new_old @ T for robot, T in self.T_root.items()}
         frames[root] = SE2.identity()
-        return Group(root, frames, self.covariance | {root: (0.0,) * 6, self.root: self.covariance[root]}, self.edges)
+        return Group(root, frames, {**self.covariance, root: (0.0,) * 6, self.root: self.covariance[root]}, self.edges)
 
 
 @dataclass(frozen=True, slots=True)

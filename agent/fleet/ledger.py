@@ -1,0 +1,137 @@
+"""Everything one coordinator knows, in one place, and the small questions all its parts ask."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+
+from agent.fleet.effects import Effect, Note, Send
+from agent.fleet.frame_graph import Edge, Group, Layout, solve
+from agent.fleet.members import Peer, Roster
+from agent.fleet.options import FleetOptions
+from agent.fleet.own_map import OwnMap
+from protocol.messages import NO_DIGEST, Evidence, Message, Stance, Statement
+
+PairKey = tuple[str, str]  # (smaller id, larger id)
+
+
+def pair_key(a: str, b: str) -> PairKey:
+    return (a, b) if a < b else (b, a)
+
+
+class Ledger:
+    """The shared memory of `Coordinator`, `PairWork`, `Composition` and `Fetching`."""
+
+    def __init__(self, robot: str, boot: int, options: FleetOptions) -> None:
+        self.robot, self.boot, self.options = robot, boot, options
+        self.own = OwnMap(robot, boot, is_frozen=options.is_frozen)
+        self.roster = Roster(options)
+        self.mine: dict[str, Statement] = {}  # our statements, by the other robot
+        self.seq = 0
+        self.live: dict[PairKey, Evidence] = {}
+        self.layout = Layout()
+        self.is_layout_old = False
+        self.effects: list[Effect] = []
+        self._next_id = 0
+
+    @property
+    def peers(self) -> dict[str, Peer]:
+        return self.roster.peers
+
+    @property
+    def group(self) -> Group | None:
+        """The group we are in; None while we are alone."""
+        return self.layout.group_of.get(self.robot)
+
+    def new_id(self) -> int:
+        self._next_id += 1
+        return self._next_id
+
+    def send(self, message: Message) -> None:
+        self.effects.append(Send(message))
+
+    def note(self, event: str, *, is_warning: bool = False, **facts: object) -> None:
+        self.effects.append(Note(event, facts, is_warning))
+
+    def is_trusted(self, robot: str, now_s: float) -> bool:
+        """Whether a robot's words count here."""
+        peer = self.peers.get(robot)
+        return robot == self.robot or (peer is not None and not peer.is_unmerged and not peer.trust.is_quarantined(now_s))
+
+    def frame_of(self, robot: str) -> int | None:
+        """The map frame a robot draws in now."""
+        if robot == self.robot:
+            return self.own.version.frame if self.own.version else None
+        peer = self.peers.get(robot)
+        version = peer.map if peer else None
+        return version.frame if version else None
+
+    def is_current(self, evidence: Evidence) -> bool:
+        """Whether it speaks of the frames both robots draw in now."""
+        frames = self.frame_of(evidence.robot_a), self.frame_of(evidence.robot_b)
+        return frames == (evidence.map_a.frame, evidence.map_b.frame)
+
+    def statement(self, author: str, other: str) -> Statement | None:
+        if author == self.robot:
+            return self.mine.get(other)
+        peer = self.peers.get(author)
+        return peer.statements.get(other) if peer else None
+
+    def judge_pair(self, a: str, b: str, now_s: float) -> None:
+        """Look again whether the edge between two robots lives."""
+        key = pair_key(a, b)
+        evidence = agreed(self.statement(*key), self.statement(key[1], key[0]))
+        if evidence is not None and not (self.is_current(evidence) and self.is_trusted(a, now_s) and self.is_trusted(b, now_s)):
+            evidence = None
+        if evidence == self.live.get(key):
+            return
+        if evidence is None:
+            del self.live[key]
+        else:
+            if self.robot in key and key not in self.live:
+                T = evidence.T_a_b
+                self.note("merged", a=key[0], b=key[1], match_factor=evidence.match_factor, T_a_b=(T.x_m, T.y_m, T.theta_rad))
+            self.live[key] = evidence
+        self.is_layout_old = True
+
+    def judge_all(self, robot: str, now_s: float) -> None:
+        """Look again at every edge of one robot."""
+        others = {key[0] if key[1] == robot else key[1] for key in self.live if robot in key}
+        others |= set(self.mine if robot == self.robot else ())
+        peer = self.peers.get(robot)
+        others |= set(peer.statements) if peer else set()
+        for other in others:
+            self.judge_pair(robot, other, now_s)
+
+    def lay_out(self) -> None:
+        """Solve the frames anew when an edge was born or died."""
+        if self.is_layout_old:
+            self.is_layout_old = False
+            self.layout = solve(
+                Edge(e.robot_a, e.robot_b, e.T_a_b, e.covariance, e.overlap_m2 * e.match_factor, e.id())
+                for e in self.live.values()
+            )
+
+
+def supported(statement: Statement) -> set[bytes]:
+    """Ids of the evidence a statement stands by."""
+    stands = {statement.holds} if statement.holds and statement.stance is not Stance.WITHDRAW else set()
+    return stands | {statement.evidence.id()} if statement.stance in (Stance.PROPOSE, Stance.ACK) else stands
+
+
+def agreed(of_a: Statement | None, of_b: Statement | None) -> Evidence | None:
+    """The evidence both sides of a pair stand by; the newest when there are two."""
+    if of_a is None or of_b is None:
+        return None
+    common = supported(of_a) & supported(of_b)
+    told = [s.evidence for s in (of_a, of_b) if s.evidence.id() in common]
+    return max(told, key=lambda e: (e.map_a.revision + e.map_b.revision, e.id()), default=None)
+
+
+def statements_digest(statements: Iterable[Statement]) -> bytes:
+    """8 bytes over all statements of one robot; nothing for none."""
+    digest = hashlib.sha256()
+    ordered = sorted(statements, key=lambda statement: statement.other)
+    for s in ordered:
+        digest.update(f"{s.other}\n{s.stance.value}\n{s.seq}\n".encode() + s.evidence.id() + s.holds)
+    return digest.digest()[:8] if ordered else NO_DIGEST

@@ -1,0 +1,176 @@
+"""Everyone else: who is there, in which life, and the newest of everything they said."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from agent.fleet.options import FleetOptions
+from agent.fleet.own_map import History
+from agent.fleet.state import Presence
+from agent.fleet.trust import Trust
+from protocol.grid import OccupancyGrid
+from protocol.messages import Beat, CoarseMap, GlobalMeta, Hello, MapAnnouncement, MapVersion, Message, Statement, Statements
+
+_RETIRED_BOOTS = 4
+_KEPT_PEER_MAPS = 6
+
+
+@dataclass(slots=True)
+class Ghost:
+    """An earlier boot of a robot: if it goes on beating, it is no earlier boot but a twin."""
+
+    last_seq: int
+    fresh_beats: int = 0
+    heard_s: float = 0.0
+
+
+@dataclass(slots=True)
+class Peer:
+    """One other robot."""
+
+    robot: str
+    boot: int
+    heard_s: float
+    beat_s: float
+    said_s: float = -1e18  # when its statements were heard last; older beats say nothing about them
+    hello: Hello | None = None
+    beat: Beat | None = None
+    announcement: MapAnnouncement | None = None
+    coarse: CoarseMap | None = None
+    meta: GlobalMeta | None = None
+    statements: dict[str, Statement] = field(default_factory=dict)
+    statements_seq: int = 0
+    held: MapVersion | None = None  # the newest version of its cells that is here
+    grid: OccupancyGrid | None = None  # the cells of `held`
+    area_m2: float = 0.0  # known area of `held`
+    admitted: MapVersion | None = None  # the newest version that may enter the global map
+    maps: History = field(default_factory=lambda: History(_KEPT_PEER_MAPS))
+    versions: dict[bytes, MapVersion] = field(default_factory=dict)  # of everything in `maps`
+    ghosts: dict[int, Ghost] = field(default_factory=dict)
+    trust: Trust = field(default_factory=Trust)
+    is_unmerged: bool = False
+    presence: Presence = Presence.ALIVE
+
+    @property
+    def map(self) -> MapVersion | None:
+        """The newest version it is known to have."""
+        spoken = [v for v in (self.beat.map if self.beat else None, self.announcement.map if self.announcement else None) if v]
+        if len(spoken) == 2 and spoken[0].frame == spoken[1].frame:
+            return max(spoken, key=lambda version: version.revision)
+        return spoken[0] if spoken else None
+
+    @property
+    def is_frozen(self) -> bool:
+        said = self.beat or self.announcement
+        return said is not None and said.is_frozen
+
+    @property
+    def known_area_m2(self) -> float:
+        return self.announcement.known_area_m2 if self.announcement else 0.0
+
+    @property
+    def period_s(self) -> float:
+        return self.beat.period_s if self.beat else 1.0
+
+    def hold(self, version: MapVersion, tiles_grid: OccupancyGrid) -> None:
+        self.held, self.grid = version, tiles_grid
+        self.area_m2 = tiles_grid.known_area_m2()
+        self.versions[version.digest] = version
+        alive = set(self.maps.digests())
+        self.versions = {digest: kept for digest, kept in self.versions.items() if digest in alive}
+
+    def forget_words(self) -> None:
+        """A new life: what the old one said is void; its cells stay, they belong to their frame."""
+        self.hello = self.beat = self.announcement = self.coarse = self.meta = None
+        self.statements, self.statements_seq = {}, 0
+
+
+class Roster:
+    """All peers, and which of their lives is believed."""
+
+    def __init__(self, options: FleetOptions) -> None:
+        self._options = options
+        self.peers: dict[str, Peer] = {}
+        self.restarted: list[str] = []  # robots whose boot changed since this list was emptied
+        self.joined: list[str] = []
+        self.twins: list[str] = []  # robots of which two lives speak at once
+
+    def hear(self, message: Message, now_s: float) -> Peer | None:
+        """The peer this message may change; None when it is from a life that is over, or the table is full."""
+        peer = self.peers.get(message.robot)
+        if peer is None:
+            if len(self.peers) >= self._options.max_peers and not self._make_room():
+                return None
+            peer = self.peers[message.robot] = Peer(message.robot, message.boot, now_s, now_s)
+            self.joined.append(peer.robot)
+        if message.boot != peer.boot:
+            if message.boot in peer.ghosts:
+                if not self._ghost_lives(peer, message, now_s):
+                    return None
+            elif not isinstance(message, Beat | Hello | MapAnnouncement):
+                return None  # a new life introduces itself first
+            self._reborn(peer, message.boot)
+        peer.heard_s = now_s
+        return peer
+
+    def accept_beat(self, peer: Peer, beat: Beat, now_s: float) -> bool:
+        """Take the beat unless a newer one is here already."""
+        if peer.beat is not None and beat.seq <= peer.beat.seq:
+            return False
+        peer.beat, peer.beat_s = beat, now_s
+        return True
+
+    def update_presence(self, now_s: float) -> list[Peer]:
+        """Judge silence; the peers whose presence changed."""
+        changed = []
+        for peer in self.peers.values():
+            presence = self._presence(peer, now_s)
+            if presence is not peer.presence:
+                peer.presence = presence
+                changed.append(peer)
+        return changed
+
+    def _presence(self, peer: Peer, now_s: float) -> Presence:
+        silent_s = now_s - peer.beat_s
+        if silent_s > max(self._options.lost_after_s, 5.0 * peer.period_s):
+            return Presence.LOST
+        return Presence.SUSPECT if silent_s > self._options.suspect_after_beats * peer.period_s else Presence.ALIVE
+
+    def _reborn(self, peer: Peer, boot: int) -> None:
+        peer.ghosts.pop(boot, None)
+        peer.ghosts[peer.boot] = Ghost(peer.beat.seq if peer.beat else 0)
+        while len(peer.ghosts) > _RETIRED_BOOTS:
+            del peer.ghosts[next(iter(peer.ghosts))]
+        peer.boot = boot
+        peer.forget_words()
+        self.restarted.append(peer.robot)
+
+    def _ghost_lives(self, peer: Peer, message: Message, now_s: float) -> bool:
+        """An earlier life that keeps beating while the later one is silent was the right one all along."""
+        ghost = peer.ghosts[message.boot]
+        if not isinstance(message, Beat) or message.seq <= ghost.last_seq:
+            return False
+        ghost.last_seq = message.seq
+        if now_s - ghost.heard_s > 0.5 * message.period_s:  # late beats come in bursts and do not count
+            ghost.fresh_beats, ghost.heard_s = ghost.fresh_beats + 1, now_s
+        if ghost.fresh_beats >= 3:
+            self.twins.append(peer.robot)
+        return ghost.fresh_beats >= 3 and now_s - peer.beat_s > 2.0 * message.period_s
+
+    def _make_room(self) -> bool:
+        """Forget the longest lost peer."""
+        lost = [peer for peer in self.peers.values() if peer.presence is Presence.LOST]
+        if not lost:
+            return False
+        del self.peers[min(lost, key=lambda peer: peer.heard_s).robot]
+        return True
+
+
+def newer_statements(peer: Peer, said: Statements) -> list[Statement]:
+    """Take over all statements of a peer; those that changed, old and new."""
+    if said.seq < peer.statements_seq:
+        return []
+    before, peer.statements = peer.statements, {statement.other: statement for statement in said.statements}
+    peer.statements_seq = said.seq
+    after = peer.statements
+    return [s for other in before.keys() | after.keys() if before.get(other) != (s := after.get(other) or before[other])]

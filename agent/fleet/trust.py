@@ -1,0 +1,42 @@
+"""How much a peer is believed: provable untruths are strikes, strikes fade, too many are quarantine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+_FADE_S = 60.0  # one strike is forgotten after this long without another
+
+STRIKES = {
+    "garbage": 0.34,  # bytes that no honest robot sends; on an open network anybody can write them in its name
+    "forged map": 1.0,  # cells that are not what they were announced to be
+    "forged global map": 1.0,
+    "equivocation": 3.0,  # two different statements under one number: nobody says that by accident
+    "false proposal": 1.0,  # evidence that our own map contradicts
+    "map turned false": 1.5,  # a map that fitted begins to contradict ours
+}
+
+
+@dataclass(slots=True)
+class Trust:
+    """What one peer has on its account."""
+
+    strikes: float = 0.0
+    counted_s: float = 0.0
+    quarantined_until_s: float = -1.0
+    reasons: dict[str, int] = field(default_factory=dict)
+
+    def strike(self, reason: str, limit: int, quarantine_s: float, now_s: float) -> bool:
+        """Put one more on the account; True when this is what sends the peer to quarantine."""
+        self.strikes = max(0.0, self.strikes - (now_s - self.counted_s) / _FADE_S) + STRIKES[reason]
+        self.counted_s = now_s
+        self.reasons[reason] = self.reasons.get(reason, 0) + 1
+        if self.strikes < limit or self.is_quarantined(now_s):
+            return False
+        self.quarantined_until_s = now_s + quarantine_s
+        return True
+
+    def is_quarantined(self, now_s: float) -> bool:
+        return now_s < self.quarantined_until_s
+
+    def pardon(self) -> None:
+        self.strikes, self.quarantined_until_s = 0.0, -1.0

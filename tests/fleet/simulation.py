@@ -1,0 +1,355 @@
+"""A whole fleet in one thread: the real coordinators and the real codec on a network that loses, delays, doubles and splits.
+
+Everything is decided by one seed; a schedule that fails is replayed by its number.  Robots see a shared world of walls, each
+in a map frame of its own; the matcher knows the true transforms but judges every transform on the cells themselves.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import math
+import random
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.fleet.consistency import agreement
+from agent.fleet.coordinator import Coordinator
+from agent.fleet.effects import Changed, Effect, Fetch, Fuse, Match, MatchKind, Note, Send
+from agent.fleet.options import FleetOptions
+from agent.merging.fusion import fuse
+from agent.merging.result import MatchFactor, MatchStatus, MergeResult
+from protocol.channels import chunk_register
+from protocol.codec import decode, encode
+from protocol.errors import RemoteProtocolError
+from protocol.features import FeatureMap
+from protocol.geometry import SE2
+from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from protocol.messages import Chunk, GlobalMap, Manifest, Message
+
+CELL_M = 0.5
+TICK_S = 0.2
+MIN_OVERLAP_M2 = 40.0
+
+
+def random_world(seed: int, side_m: float = 60.0) -> OccupancyGrid:
+    """Free space with walls: nothing repeats."""
+    rng = np.random.default_rng(seed)
+    n = int(side_m / CELL_M)
+    cells = np.full((n, n), FREE, np.int8)
+    for _ in range(n):
+        r, c, length = rng.integers(0, n), rng.integers(0, n), int(rng.integers(4, n // 4))
+        if rng.random() < 0.5:
+            cells[r, c : c + length] = OCCUPIED
+        else:
+            cells[r : r + length, c] = OCCUPIED
+    return OccupancyGrid(cells, CELL_M, SE2(-side_m / 2, -side_m / 2, 0.0))
+
+
+@dataclass
+class Explorer:
+    """What one robot has seen of the world, in its own map frame."""
+
+    world: OccupancyGrid
+    T_world_map: SE2
+    seen: NDArray[np.bool_]
+    T_world_robot: SE2
+    epoch: int = 1
+
+    @staticmethod
+    def at(world: OccupancyGrid, T_world_robot: SE2, turn_rad: float) -> Explorer:
+        frame = SE2(T_world_robot.x_m, T_world_robot.y_m, turn_rad)
+        return Explorer(world, frame, np.zeros(world.cells.shape, np.bool_), T_world_robot)
+
+    def look(self, T_world_robot: SE2, radius_m: float = 8.0) -> None:
+        """Uncover the world around a place."""
+        self.T_world_robot = T_world_robot
+        row, col = self.world.cells_at([[T_world_robot.x_m, T_world_robot.y_m]])[0]
+        reach = int(radius_m / CELL_M)
+        rows, cols = slice(max(row - reach, 0), max(row + reach, 0)), slice(max(col - reach, 0), max(col + reach, 0))
+        self.seen[rows, cols] = True
+
+    @property
+    def grid(self) -> OccupancyGrid:
+        """(H, W) the seen part, drawn in the map frame; walls and edges may be a cell off, as in real maps."""
+        seen = OccupancyGrid(np.where(self.seen, self.world.cells, UNKNOWN).astype(np.int8), CELL_M, self.world.origin).cropped()
+        T_map_world = self.T_world_map.inverse()
+        corners = T_map_world.apply(
+            seen.origin.apply(
+                [[0, 0], [seen.width * CELL_M, 0], [0, seen.height * CELL_M], [seen.width * CELL_M, seen.height * CELL_M]]
+            )
+        )
+        low = np.floor(corners.min(axis=0) / CELL_M).astype(int)
+        size = np.ceil(corners.max(axis=0) / CELL_M).astype(int) - low + 1
+        frame = OccupancyGrid(np.full((size[1], size[0]), UNKNOWN, np.int8), CELL_M, SE2(low[0] * CELL_M, low[1] * CELL_M, 0.0))
+        every = np.indices(frame.cells.shape).reshape(2, -1).T
+        frame.cells[:] = seen.values_at(self.T_world_map.apply(frame.points_of(every))).reshape(frame.cells.shape)
+        return frame
+
+    @property
+    def T_map_robot(self) -> SE2:
+        return self.T_world_map.inverse() @ self.T_world_robot
+
+
+@dataclass
+class Link:
+    """How one direction of the network behaves."""
+
+    loss: float = 0.0
+    delay_s: tuple[float, float] = (0.005, 0.03)
+    duplicates: float = 0.0
+
+
+@dataclass
+class Node:
+    """One robot process."""
+
+    name: str
+    explorer: Explorer | None
+    options: FleetOptions
+    coordinator: Coordinator | None = None
+    life: int = 0
+    clock_offset_s: float = 0.0
+    global_map: GlobalMap | None = None
+    notes: list[Note] = field(default_factory=list)
+    sent: Counter[str] = field(default_factory=Counter)  # bytes by kind
+    messages: Counter[str] = field(default_factory=Counter)
+    received_bytes: int = 0
+    pulled_bytes: int = 0
+
+    @property
+    def is_up(self) -> bool:
+        return self.coordinator is not None
+
+
+Judge = Callable[["Fleet", Node, Match], MergeResult]
+
+
+class Fleet:
+    """The event loop: time, network, and what the coordinators ask for."""
+
+    def __init__(self, seed: int, *, link: Link | None = None, judge: Judge | None = None, is_encoded: bool = True) -> None:
+        self.rng = random.Random(seed)
+        self.link = link or Link()
+        self.judge = judge or truthful
+        self.is_encoded = is_encoded
+        self.now_s = 0.0
+        self.nodes: dict[str, Node] = {}
+        self.partition: dict[str, int] = {}
+        self.blocked: set[tuple[str, str]] = set()  # one-way cuts
+        self._events: list[tuple[float, int, Callable[[], None]]] = []
+        self._order = itertools.count()
+
+    # Robots.
+
+    def add(self, name: str, explorer: Explorer | None, options: FleetOptions | None = None) -> Node:
+        node = self.nodes[name] = Node(name, explorer, options or FleetOptions())
+        self.start(node)
+        return node
+
+    def start(self, node: Node) -> None:
+        node.life += 1
+        node.coordinator = Coordinator(node.name, self.rng.getrandbits(64), node.options)
+        node.global_map = None
+        if node.explorer is not None:
+            self.share_map(node)
+        self._tick(node, node.life)
+
+    def crash(self, node: Node) -> None:
+        node.coordinator, node.life = None, node.life + 1
+
+    def share_map(self, node: Node) -> None:
+        assert node.explorer is not None
+        if node.coordinator is not None:
+            self.carry_out(node, node.coordinator.on_local_map(node.explorer, FeatureMap(), self.local_s(node)))
+
+    def local_s(self, node: Node) -> float:
+        return self.now_s + node.clock_offset_s
+
+    # Time.
+
+    def at(self, delay_s: float, action: Callable[[], None]) -> None:
+        heapq.heappush(self._events, (self.now_s + delay_s, next(self._order), action))
+
+    def run(self, duration_s: float) -> None:
+        end_s = self.now_s + duration_s
+        while self._events and self._events[0][0] <= end_s:
+            self.now_s, _, action = heapq.heappop(self._events)
+            action()
+        self.now_s = end_s
+
+    def run_until(self, condition: Callable[[], bool], timeout_s: float, step_s: float = 0.2) -> float:
+        """Simulated seconds until the condition holds; fails the test when it does not in time."""
+        start_s = self.now_s
+        while not condition():
+            assert self.now_s - start_s < timeout_s, f"not within {timeout_s} simulated seconds: {self.describe()}"
+            self.run(step_s)
+        return self.now_s - start_s
+
+    def _tick(self, node: Node, life: int) -> None:
+        if node.life != life or node.coordinator is None:
+            return
+        self.carry_out(node, node.coordinator.tick(self.local_s(node)))
+        self.at(TICK_S * self.rng.uniform(0.9, 1.1), lambda: self._tick(node, life))
+
+    # Effects.
+
+    def carry_out(self, node: Node, effects: Iterable[Effect]) -> None:
+        for effect in effects:
+            match effect:
+                case Send():
+                    self.publish(node, effect.message)
+                case Fetch():
+                    self._fetch(node, effect)
+                case Match():
+                    self._match(node, effect)
+                case Fuse():
+                    self._fuse(node, effect)
+                case Changed():
+                    node.global_map = effect.global_map
+                case Note():
+                    node.notes.append(effect)
+
+    def publish(self, node: Node, message: Message) -> None:
+        """Offer a message to everybody; each link decides its fate."""
+        data = encode(message)
+        kind = type(message).__name__
+        node.sent[kind] += len(data)
+        node.messages[kind] += 1
+        for other in self.nodes.values():
+            if other is not node and self.connects(node.name, other.name):
+                for _ in range(1 + (self.rng.random() < self.link.duplicates)):
+                    if self.rng.random() >= self.link.loss:
+                        self.at(
+                            self.rng.uniform(*self.link.delay_s),
+                            lambda o=other, life=other.life: self._deliver(o, life, data, message),
+                        )
+
+    def _deliver(self, node: Node, life: int, data: bytes, message: Message) -> None:
+        if node.coordinator is None or node.life != life:
+            return
+        node.received_bytes += len(data)
+        said = decode(data) if self.is_encoded else message
+        self.carry_out(node, node.coordinator.on_message(said, self.local_s(node)))
+
+    def _fetch(self, node: Node, fetch: Fetch) -> None:
+        life, delay_s = node.life, 2 * self.rng.uniform(*self.link.delay_s)
+
+        def answer() -> None:
+            if node.life != life or node.coordinator is None:
+                return
+            message = self._pull(node, fetch)
+            self.carry_out(node, node.coordinator.on_fetched(fetch, message, self.local_s(node)))
+
+        is_lost = self.rng.random() < self.link.loss
+        self.at(delay_s if not is_lost else 2.0, (lambda: None) if is_lost and self.rng.random() < 0.1 else answer)
+
+    def _pull(self, node: Node, fetch: Fetch) -> Message | None:
+        peer = self.nodes.get(fetch.peer)
+        if peer is None or peer.coordinator is None or not self.connects(node.name, fetch.peer):
+            return None
+        if self.rng.random() < self.link.loss:
+            return None
+        data = peer.coordinator.register(fetch.key)
+        if data is None:
+            return None
+        try:
+            message = decode(data)
+            if isinstance(message, Manifest):
+                parts = []
+                for i in range(message.chunks):
+                    piece = peer.coordinator.register(chunk_register(message.digest, i))
+                    chunk = decode(piece) if piece else None
+                    if not isinstance(chunk, Chunk):
+                        return None
+                    parts.append(chunk.data)
+                data = b"".join(parts)
+                message = decode(data)
+        except RemoteProtocolError:
+            return None
+        node.pulled_bytes += len(data)
+        peer.sent[type(message).__name__] += len(data)
+        peer.messages[type(message).__name__] += 1
+        return message
+
+    def _match(self, node: Node, job: Match) -> None:
+        life = node.life
+
+        def finish() -> None:
+            if node.life == life and node.coordinator is not None:
+                result = self.judge(self, node, job)
+                self.carry_out(node, node.coordinator.on_match_done(job, result, self.local_s(node)))
+
+        self.at(self.rng.uniform(0.02, 0.2), finish)
+
+    def _fuse(self, node: Node, job: Fuse) -> None:
+        life = node.life
+
+        def finish() -> None:
+            if node.life == life and node.coordinator is not None:
+                fused = fuse(job.maps, job.resolution_m)
+                self.carry_out(node, node.coordinator.on_fused(job, fused, self.local_s(node)))
+
+        self.at(self.rng.uniform(0.02, 0.2), finish)
+
+    # The network.
+
+    def connects(self, a: str, b: str) -> bool:
+        return self.partition.get(a, 0) == self.partition.get(b, 0) and (a, b) not in self.blocked
+
+    def split(self, *sides: Iterable[str]) -> None:
+        self.partition = {name: i + 1 for i, side in enumerate(sides) for name in side}
+
+    def heal(self) -> None:
+        self.partition, self.blocked = {}, set()
+
+    # What holds.
+
+    def true_T(self, a: str, b: str) -> SE2:
+        """T_a_b of the two map frames."""
+        first, second = self.nodes[a].explorer, self.nodes[b].explorer
+        assert first is not None and second is not None
+        return first.T_world_map.inverse() @ second.T_world_map
+
+    def digests(self) -> dict[str, str]:
+        return {
+            node.name: node.global_map.digest.hex()[:8] if node.global_map else "-" for node in self.nodes.values() if node.is_up
+        }
+
+    def agrees(self, names: Iterable[str]) -> bool:
+        """Whether these robots hold one and the same global map of exactly them."""
+        maps = [self.nodes[name].global_map for name in names]
+        first = maps[0]
+        if first is None or {member.robot for member in first.members} != set(names):
+            return False
+        return all(other is not None and other.digest == first.digest and other.members == first.members for other in maps)
+
+    def describe(self) -> str:
+        lines = [f"t={self.now_s:.1f} digests={self.digests()}"]
+        for node in self.nodes.values():
+            if node.coordinator is not None:
+                state = node.coordinator.state(self.local_s(node))
+                pairs = {p.robot: (p.pair, p.presence.value, p.reason) for p in state.peers}
+                lines.append(f"  {node.name}: composer={state.composer} root={state.root} frames={sorted(state.frames)} {pairs}")
+        return "\n".join(lines)
+
+
+def truthful(fleet: Fleet, node: Node, job: Match) -> MergeResult:
+    """The true transform where the cells bear it out; verification of any transform on the cells."""
+    T = job.T_ours_theirs if job.kind is MatchKind.VERIFY else fleet.true_T(node.name, job.peer)
+    assert T is not None
+    return judged(job.ours, job.theirs, T)
+
+
+def judged(ours: OccupancyGrid, theirs: OccupancyGrid, T: SE2) -> MergeResult:
+    found = agreement(ours, theirs, T)
+    factor = MatchFactor(found.agree, found.conflict)
+    overlap_m2 = (found.agree + found.conflict) * theirs.resolution_m**2
+    is_good = factor.value >= 0.85 and overlap_m2 >= MIN_OVERLAP_M2
+    status = MatchStatus.MERGED if is_good else MatchStatus.NO
+    covariance = np.diag([1e-3, 1e-3, math.radians(0.2) ** 2])
+    return MergeResult(status, T, covariance, factor, overlap_m2, overlap_m2 if is_good else 0.0, reason="simulated")
