@@ -45,9 +45,8 @@ class Figures:
         if self.agreement is not None:
             parts.append(f"{self.agreement:.1%} of its cells agree with the simulated world")
         if self.pose_errors_m:
-            parts.append(
-                "pose errors " + ", ".join(f"{robot} {error * 100:.1f} cm" for robot, error in sorted(self.pose_errors_m.items()))
-            )
+            errors = (f"{robot} {error * 100:.1f} cm" for robot, error in sorted(self.pose_errors_m.items()))
+            parts.append(f"pose errors {', '.join(errors)}")
         parts.append(f"{self.conflicting_cells} cells conflict and are unknown")
         return "; ".join(parts)
 
@@ -63,10 +62,8 @@ def aligned(fused: OccupancyGrid, truth: OccupancyGrid, T_world_global: SE2) -> 
         for _ in range(ROUNDS):
             moves = [SE2(dx, dy, 0.0) for dx in (-step_m, 0.0, step_m) for dy in (-step_m, 0.0, step_m)]
             turns = [SE2(0.0, 0.0, -step_rad), SE2(0.0, 0.0, step_rad)]
-            tried = [
-                (cost(walls_m, T, truth, distance_m), T)
-                for T in (*(move @ best for move in moves), *(best @ turn for turn in turns))
-            ]
+            neighbours = [move @ best for move in moves] + [best @ turn for turn in turns]
+            tried = [(cost(walls_m, T, truth, distance_m), T) for T in neighbours]
             winner_cost, winner = min(tried, key=lambda entry: entry[0])
             if winner_cost >= best_cost:
                 break

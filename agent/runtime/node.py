@@ -190,7 +190,7 @@ def match_options(config: Config) -> MatchOptions:
     )
 
 
-def network_settings(config: Config) -> NetworkSettings:
+def network_settings(config: Config, *, is_router: bool = False) -> NetworkSettings:
     fleet = config.fleet
     return NetworkSettings(
         robot=config.robot.id,
@@ -202,4 +202,5 @@ def network_settings(config: Config) -> NetworkSettings:
         allow_open=fleet.allow_open,
         key_file=Path(fleet.key_file) if fleet.key_file else None,
         certificates=Path(fleet.certificates) if fleet.certificates else None,
+        is_router=is_router,
     ).checked()
