@@ -28,6 +28,7 @@ class TiledFields:
 
     def __init__(self, particles: int, resolution_m: float, sigma_m: float) -> None:
         self.resolution_m = resolution_m
+        self.sigma_m = sigma_m
         self.first_tile = np.zeros(2, np.int64)  # (row, col) of tables[:, 0, 0], in tiles from the map's origin
         self.tables: Ints = np.zeros((particles, 1, 1), np.int64)
         self.pool = np.zeros((256, AREA), np.uint8)

@@ -1,7 +1,7 @@
 """Where a scan fits: Gauss-Newton on the likelihood field, for one pose or for all particles at once.
 
-Minimises  sum_i (1 - L(T p_i))^2  +  (x - prior)' W (x - prior)   over the pose x = (x, y, theta); L is the field, W
-what odometry knows.  The sum's curvature H says what the walls determine: where its weakest eigenvalue is a small part
+Maximises  sum_i L(T p_i)  -  1/2 (x - prior)' W (x - prior)   over the pose x = (x, y, theta); L is the field, a Gaussian
+of the distance to the nearest wall, and W what odometry knows.  The sum's curvature H says what the walls determine: where its weakest eigenvalue is a small part
 of the strongest, the geometry leaves that direction open (a corridor) and the prior decides.
 """
 
@@ -16,6 +16,8 @@ from agent.mapping.likelihood import TiledFields
 
 ITERATIONS = 4
 MAX_STEP = np.array([0.15, 0.15, 0.1])  # metres, metres, radians: a wilder step has left the basin
+PRIOR_GAIN = 0.3  # neighbouring beams repeat one another, but odometry errs in the same direction again and again
+FLAT_SLOPE = np.float32(1.0)  # per metre: below it a slope is rounding, not the direction of a wall
 ARM_M = 5.0  # a radian counts as this many metres when directions are compared
 UNCONSTRAINED_RATIO = 0.02  # weakest to strongest curvature; a bare corridor with a few door frames has about 0.01
 
@@ -48,13 +50,22 @@ def refine(
     poses = poses.copy()
     for _ in range(iterations):
         value, jacobian = linearised(fields, particles, poses, points_m)
-        curvature = np.einsum("pim,pjm->pij", jacobian, jacobian).astype(np.float64)
-        pull = np.einsum("pim,pm->pi", jacobian, 1.0 - value).astype(np.float64)
-        pull += np.einsum("pij,pj->pi", weights, difference(priors, poses))
-        step = np.linalg.solve(curvature + weights, pull[:, :, None])[:, :, 0]
+        pull = jacobian.sum(axis=2, dtype=np.float64) + np.einsum("pij,pj->pi", weights, difference(priors, poses))
+        step = np.linalg.solve(curvature_of(fields, value, jacobian) + weights, pull[:, :, None])[:, :, 0]
         poses += np.clip(step, -MAX_STEP, MAX_STEP)
     value, jacobian = linearised(fields, particles, poses, points_m)
-    return Fit(poses, value, np.einsum("pim,pjm->pij", jacobian, jacobian).astype(np.float64))
+    return Fit(poses, value, curvature_of(fields, value, jacobian))
+
+
+def curvature_of(fields: TiledFields, value: NDArray[np.float32], jacobian: NDArray[np.float32]) -> NDArray[np.float64]:
+    """(P, 3, 3) second derivative of sum L, as if every point were pulled to its wall by a spring of stiffness L / sigma^2.
+
+    The field's own slope vanishes on the wall, so only its direction is used: Gauss-Newton on 1 - L halves the error in
+    each step, this one removes it.
+    """
+    slope = jacobian[:, 0] ** 2 + jacobian[:, 1] ** 2 + FLAT_SLOPE**2
+    stiffness = value / (slope * np.float32(fields.sigma_m**2))
+    return np.einsum("pim,pjm->pij", jacobian * stiffness[:, None], jacobian).astype(np.float64)
 
 
 def linearised(
@@ -84,7 +95,7 @@ def difference(a: Poses, b: Poses) -> Poses:
 
 def information(deviation_m: float, deviation_rad: float) -> NDArray[np.float64]:
     """(3, 3) inverse covariance of a round prior."""
-    return np.diag([deviation_m**-2, deviation_m**-2, deviation_rad**-2])
+    return PRIOR_GAIN * np.diag([deviation_m**-2, deviation_m**-2, deviation_rad**-2])
 
 
 def weakest_direction(curvature: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:

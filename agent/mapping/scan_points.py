@@ -17,7 +17,9 @@ from hw.readings import LaserScan
 from protocol.geometry import SE2
 
 VOXEL_M = 0.05  # one point a voxel for matching: a near wall must not outvote the rest of the room
-WIDEST_GAP_M = 0.4  # two neighbouring hits farther apart may be two things
+FACING_GAP_M = 0.4  # two neighbouring hits farther apart may be two things ...
+WIDEST_GAP_M = 1.0  # ... unless a third lies in line with them
+STRAIGHT = np.float32(0.985)  # cosine of 10 degrees
 STEEPEST = 0.85  # change of range per gap: beyond it the surface is seen so flat that it may be a depth jump
 
 
@@ -65,12 +67,24 @@ def between(ends_m: NDArray[np.float32], is_hit: NDArray[np.bool_], ranges_m: ND
 
     Without them a field of sparse beams is a row of dots, and the next scan's dots slide into them.
     """
-    gap_m = np.hypot(*(ends_m[1:] - ends_m[:-1]).T)
-    is_surface = is_hit[1:] & is_hit[:-1] & (gap_m < WIDEST_GAP_M) & (np.abs(np.diff(ranges_m)) < STEEPEST * gap_m)
+    step_m = ends_m[1:] - ends_m[:-1]
+    gap_m = np.hypot(step_m[:, 0], step_m[:, 1])
+    is_facing = (gap_m < FACING_GAP_M) & (np.abs(np.diff(ranges_m)) < STEEPEST * gap_m)
+    is_surface = (is_facing | goes_on_straight(step_m, gap_m)) & is_hit[1:] & is_hit[:-1]
     inner = np.where(is_surface, np.ceil(gap_m / VOXEL_M) - 1, 0).astype(np.int64)
     first = np.repeat(np.arange(len(gap_m)), inner)
     share = (np.arange(len(first)) - np.repeat(np.cumsum(inner) - inner, inner) + 1) / (inner[first] + 1)
     return (ends_m[first] + share[:, None].astype(np.float32) * (ends_m[first + 1] - ends_m[first])).astype(np.float32)
+
+
+def goes_on_straight(step_m: NDArray[np.float32], gap_m: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Gaps in line with the gap before or after them: a wall seen at a flat angle, not the edge of a door."""
+    along = (step_m[1:] * step_m[:-1]).sum(axis=1) > STRAIGHT * gap_m[1:] * gap_m[:-1]
+    similar = (gap_m[1:] < 2.0 * gap_m[:-1]) & (gap_m[:-1] < 2.0 * gap_m[1:])
+    is_straight = np.zeros(len(gap_m), bool)
+    is_straight[1:] |= along & similar
+    is_straight[:-1] |= along & similar
+    return is_straight & (gap_m < WIDEST_GAP_M)
 
 
 def beam_stamps_s(scan: LaserScan) -> NDArray[np.float64]:

@@ -40,8 +40,8 @@ def test_the_pose_stays_right_though_the_wheels_drift(driven: tuple[MapEstimate,
     _, poses = driven
     T_map_world = poses[0][0].inverse()
     errors = [(T_map_world @ true).inverse() @ estimated for true, estimated in poses]
-    assert max(math.hypot(e.x_m, e.y_m) for e in errors) < 0.10
-    assert max(abs(e.theta_rad) for e in errors) < math.radians(1.0)
+    assert max(math.hypot(e.x_m, e.y_m) for e in errors) < 0.05
+    assert max(abs(e.theta_rad) for e in errors) < math.radians(0.6)
 
 
 def test_walls_are_where_they_are(driven: tuple[MapEstimate, list[tuple[SE2, SE2]]]) -> None:
