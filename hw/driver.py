@@ -90,6 +90,7 @@ class Driver(Protocol):
     """One device, understood.  `bauds`: the rates it may speak at, likeliest first."""
 
     bauds: tuple[int, ...]
+    baud: int  # now
     counters: Counters
     identity: Identity
     period_s: float  # usual time from one reading to the next

@@ -192,6 +192,42 @@ class FixedFrames:
         return np.flatnonzero(is_candidate)
 
 
+class SizedFrames:
+    """Takes frames that tell their own length; they are handed on in rows of one length, padded with zeros."""
+
+    def __init__(
+        self, header: bytes, head_bytes: int, most_bytes: int, size: Callable[[bytearray], int], judge: Callable[[bytes], bool]
+    ) -> None:
+        self._header, self._head_bytes, self._most = header, head_bytes, most_bytes
+        self._size = size  # of the frame at the front of the window, from its first `head_bytes`; 0: it is none
+        self._judge = judge
+
+    def take(self, window: ByteWindow, counters: Counters) -> Frames:
+        """All good frames that are complete; what cannot begin a frame is skipped and counted."""
+        taken: list[bytes] = []
+        left: list[int] = []
+        gaps: list[int] = []
+        while True:
+            window.skip_to(self._header)
+            if len(window) < self._head_bytes:
+                break
+            size = self._size(window.data)
+            if size and len(window) < size:
+                break
+            frame = bytes(window.data[:size])
+            if size and self._judge(frame):
+                window.take(size)
+                taken.append(frame.ljust(self._most, b"\0"))
+                left.append(len(window))
+                gaps.append(counters.good())
+            else:
+                counters.bad_frames += 1
+                window.skip(1)
+        window.trim()
+        data = np.frombuffer(b"".join(taken), np.uint8).reshape(-1, self._most)
+        return Frames(data, np.array(left, np.int64), np.array(gaps, np.int64))
+
+
 def chain(good: NDArray[np.int64], length: int) -> NDArray[np.int64]:
     """Walk over good positions as the byte-at-a-time search does: each frame begins at or after the end of the one before."""
     if len(good) < 2 or np.all(np.diff(good) >= length):

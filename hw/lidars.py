@@ -5,16 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from hw.driver import Driver
+from hw.hokuyo import Hokuyo
 from hw.ld06 import MODELS as LDROBOT_MODELS
 from hw.ld06 import Ld06
 from hw.rplidar import DEFAULT_PWM, DEFAULT_RPM, MODES, Rplidar
+from hw.sick_lms import RATE_CODES, SickLms
 from hw.spinning import SpinningLidar
 from hw.urls import DeviceUrl
+from hw.xv11 import LDS01, XV11, Kind, Xv11
+from hw.ydlidar import MODELS as YDLIDAR_MODELS
+from hw.ydlidar import YdLidar
 
 COMMON = ("baud", "range_min", "range_max")
+Build = Callable[[DeviceUrl], Driver]
 
 
-def _ldrobot(model: str) -> Callable[[DeviceUrl], Driver]:
+def _ldrobot(model: str) -> Build:
     def build(url: DeviceUrl) -> Driver:
         url.only(COMMON)
         return _limited(Ld06(model), url)
@@ -29,12 +35,47 @@ def _rplidar(url: DeviceUrl) -> Driver:
     return _limited(Rplidar(mode, rpm, pwm), url)
 
 
-def _limited(driver: SpinningLidar, url: DeviceUrl) -> Driver:
+def _ydlidar(url: DeviceUrl) -> Driver:
+    url.only((*COMMON, "model", "intensity"))
+    model = url.text_of("model", "auto", ["auto", *YDLIDAR_MODELS])
+    bits = url.text_of("intensity", "auto", ["auto", "0", "8", "10", "16"])
+    return _limited(YdLidar(None if model == "auto" else model, None if bits == "auto" else int(bits)), url)
+
+
+def _hokuyo(url: DeviceUrl) -> Driver:
+    url.only((*COMMON, "intensity", "free"))
+    driver = Hokuyo(url.integer("intensity", 0, 0, 1) == 1, url.integer("free", 0, 0, 1) == 1)
+    if "range_min" in url.options or "range_max" in url.options:
+        return _limited(driver, url)
+    return driver
+
+
+def _sick(url: DeviceUrl) -> Driver:
+    url.only((*COMMON, "rate", "step"))
+    rate = int(url.text_of("rate", "38400", map(str, RATE_CODES)))
+    step = url.text_of("step", "as-is", ["as-is", "0.25", "0.5", "1"])
+    return _limited(SickLms(rate, None if step == "as-is" else float(step)), url)
+
+
+def _neato(kind: Kind) -> Build:
+    def build(url: DeviceUrl) -> Driver:
+        url.only(COMMON)
+        return _limited(Xv11(kind), url)
+
+    return build
+
+
+def _limited(driver: SpinningLidar | Hokuyo | SickLms, url: DeviceUrl) -> Driver:
     driver.limit(url.number("range_min", driver.range_min_m), url.number("range_max", driver.range_max_m))
     return driver
 
 
-LIDARS: dict[str, Callable[[DeviceUrl], Driver]] = {
+LIDARS: dict[str, Build] = {
     **{model: _ldrobot(model) for model in LDROBOT_MODELS},
     "rplidar": _rplidar,
+    "ydlidar": _ydlidar,
+    "hokuyo": _hokuyo,
+    "sick": _sick,
+    "xv11": _neato(XV11),
+    "lds01": _neato(LDS01),
 }

@@ -172,7 +172,7 @@ class Rplidar(SpinningLidar):
 
     def feed(self, data: bytes, now_s: float) -> list[Reading]:
         """Scans that these bytes complete; answers are kept for the script."""
-        self._window.push(data)
+        self._arrive(data, now_s)
         readings: list[Reading] = []
         while True:
             if self._single is not None:

@@ -6,14 +6,46 @@ earlier anyway.
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 from numpy.typing import NDArray
 
 from hw.driver import DriverBase, Reading
-from hw.framing import Bytes, ByteWindow, FixedFrames, Frames
+from hw.framing import Bytes, ByteWindow, FixedFrames, Frames, SizedFrames
 from hw.scan_assembler import Beams, ScanAssembler
 
+PACE_S = 1.0  # over how long the true rate of bytes is measured
+PACE_GAP_S = 0.2  # a longer silence is no pace
 HOLD_AT_MOST = 256  # frames: bounds delay and memory when no revolution ends
+
+
+class Pace:
+    """Seconds a byte, as they really come.
+
+    Frames that were read together are dated back from the newest by this, not by the line's rate: a device makes its
+    frames at its own pace, however fast the line then carries them.
+    """
+
+    def __init__(self) -> None:
+        self._marks: deque[tuple[float, int]] = deque()  # (time, bytes until then)
+        self._total = 0
+
+    def add(self, now_s: float, n: int) -> None:
+        """n bytes came."""
+        if self._marks and not 0 <= now_s - self._marks[-1][0] < PACE_GAP_S:
+            self._marks.clear()
+        self._total += n
+        self._marks.append((now_s, self._total))
+        while now_s - self._marks[0][0] > PACE_S:
+            self._marks.popleft()
+
+    def byte_s(self, least_s: float) -> float:
+        """Seconds a byte; `least_s`, the line's own, as long as too little was seen."""
+        (first_s, first), (last_s, last) = self._marks[0], self._marks[-1]
+        if last_s - first_s < PACE_S / 10:
+            return least_s
+        return max(least_s, (last_s - first_s) / (last - first))
 
 
 class SpinningLidar(DriverBase):
@@ -25,6 +57,7 @@ class SpinningLidar(DriverBase):
         self._assembler = ScanAssembler(range_min_m, range_max_m)
         self._held: list[Frames] = []
         self._held_arrivals_s: list[NDArray[np.float64]] = []
+        self._pace = Pace()
 
     @property
     def coverage(self) -> float:
@@ -55,6 +88,10 @@ class SpinningLidar(DriverBase):
         """See `Driver.feed`."""
         raise NotImplementedError
 
+    def _arrive(self, data: bytes, now_s: float) -> None:
+        self._window.push(data)
+        self._pace.add(now_s, len(data))
+
     def _drop_held(self) -> None:
         self._held.clear()
         self._held_arrivals_s.clear()
@@ -63,7 +100,7 @@ class SpinningLidar(DriverBase):
         """Keep these frames; decode what is kept when a revolution ends."""
         if len(frames):
             self._held.append(frames)
-            self._held_arrivals_s.append(now_s - frames.behind.astype(np.float64) * (10.0 / self.baud))
+            self._held_arrivals_s.append(now_s - frames.behind.astype(np.float64) * self._pace.byte_s(10.0 / self.baud))
         if not self._held or not (is_turn or sum(map(len, self._held)) >= HOLD_AT_MOST):
             return []
         data = np.concatenate([held.data for held in self._held])
@@ -82,11 +119,11 @@ class SpinningLidar(DriverBase):
 class FixedFrameLidar(SpinningLidar):
     """A spinning LIDAR that sends frames of one kind only."""
 
-    frames: FixedFrames
+    frames: FixedFrames | SizedFrames
 
     def feed(self, data: bytes, now_s: float) -> list[Reading]:
         """Scans that these bytes complete."""
-        self._window.push(data)
+        self._arrive(data, now_s)
         frames = self.frames.take(self._window, self.counters)
         return self._hold(frames, now_s, len(frames) > 0 and self._is_turn(frames))
 

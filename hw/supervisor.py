@@ -190,7 +190,7 @@ class Device:
             except (DeviceSilent, DeviceGarbled) as error:
                 problems.append(error)
                 continue
-            self._good_baud, self._attempts = baud, 0
+            self._good_baud, self._attempts = self._driver.baud, 0  # the script may have changed it
             return
         if problems:
             raise next((p for p in problems if isinstance(p, DeviceGarbled)), problems[0])
