@@ -17,7 +17,7 @@ from agent.fleet.effects import Changed, Effect, Fetch, Fuse, Match, MatchKind, 
 from agent.fleet.state import FleetState
 from agent.runtime.exchange import Exchange
 from agent.runtime.latest import Latest
-from agent.runtime.merge_worker import Done, MergeWorker
+from agent.runtime.merge_worker import Done, Matched, MergeWorker
 from agent.runtime.network import NetworkSettings
 from agent.runtime.pulling import Pull
 from protocol.channels import BY_KIND, parse_key, push_register, robot_key, subscriptions
@@ -127,12 +127,10 @@ class FleetWorker:
         if isinstance(result, tuple):
             fetch, message = result
             self._do(lambda now_s: self._coordinator.on_fetched(fetch, message, now_s))
-        elif isinstance(result.job, Match):
-            job, found = result.job, result.result
-            self._do(lambda now_s: self._coordinator.on_match_done(job, found, now_s))
+        elif isinstance(result, Matched):
+            self._do(lambda now_s: self._coordinator.on_match_done(result.job, result.result, now_s))
         else:
-            fuse_job, fused = result.job, result.result
-            self._do(lambda now_s: self._coordinator.on_fused(fuse_job, fused, now_s))
+            self._do(lambda now_s: self._coordinator.on_fused(result.job, result.result, now_s))
 
     def _register(self, key: str) -> bytes | None:
         """The answer to a query, on the answering thread."""

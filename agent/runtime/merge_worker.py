@@ -28,14 +28,22 @@ RANK = {MatchKind.VERIFY: 1, MatchKind.COARSE: 2, MatchKind.SEARCH: 3}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Done:
-    """A finished job; `result` is None when it failed."""
+class Matched:
+    """A finished comparison; `result` is None when it failed or was dropped."""
 
-    job: Match | Fuse
-    result: MergeResult | FusedMap | None
-    cpu_s: float
+    job: Match
+    result: MergeResult | None
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Laid:
+    """A finished global map; `result` is None when it failed or was dropped."""
+
+    job: Fuse
+    result: FusedMap | None
+
+
+Done = Matched | Laid
 OnDone = Callable[[Done], None]
 
 
@@ -58,7 +66,7 @@ class MergeWorker:
             self._jobs.put_nowait((rank, next(self._order), job, on_done))
         except queue.Full:
             self.dropped += 1
-            on_done(Done(job, None, 0.0))
+            on_done(Laid(job, None) if isinstance(job, Fuse) else Matched(job, None))
 
     def waiting(self) -> int:
         return self._jobs.qsize()
@@ -69,14 +77,13 @@ class MergeWorker:
         except queue.Empty:
             return
         started = time.thread_time()
-        result: MergeResult | FusedMap | None = None
+        done: Done = Laid(job, None) if isinstance(job, Fuse) else Matched(job, None)
         try:
-            result = fuse(job.maps, job.resolution_m) if isinstance(job, Fuse) else self._match(job)
+            done = Laid(job, fuse(job.maps, job.resolution_m)) if isinstance(job, Fuse) else Matched(job, self._match(job))
         finally:
-            cpu_s = time.thread_time() - started
-            self.cpu_s += cpu_s
+            self.cpu_s += time.thread_time() - started
             self.finished += 1
-            on_done(Done(job, result, cpu_s))
+            on_done(done)
 
     def _match(self, job: Match) -> MergeResult:
         ours = self._snapshot(job.ours_digest, job.ours)
