@@ -25,6 +25,8 @@ COMMANDS: dict[str, tuple[str, str]] = {  # name: (module, what it does)
     "resume": ("agent.commands.control", "the running robot goes on mapping"),
     "reset": ("agent.commands.control", "the running robot starts an empty map"),
     "unmerge": ("agent.commands.control", "the running robot takes a merge back"),
+    "readmit": ("agent.commands.control", "a robot that was unmerged may merge again"),
+    "stop": ("agent.commands.control", "the running robot saves its map and ends"),
     "save": ("agent.commands.control", "the running robot writes its state now"),
     "merge": ("agent.commands.merge", "lay map files over one another: nav2 maps in and out"),
     "map": ("agent.commands.map", "a recording (CARMEN log, rosbag2, MCAP) into a map"),

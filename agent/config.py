@@ -43,7 +43,7 @@ class RobotConfig:
 class LidarConfig:
     """The laser and where it sits on the robot: the pose of its frame in the base frame (x forward, y left)."""
 
-    url: str = ""  # rplidar:/dev/ttyUSB0, ld06:..., sim:office?seed=3, log:FILE.clf; empty: `mapquilt run` looks for one
+    url: str = ""  # rplidar:/dev/ttyUSB0, ld06:..., sim:office?seed=3, log:FILE.clf; `mapquilt run` needs one
     mount_x_m: float = setting(0.0, low=-10.0, high=10.0)
     mount_y_m: float = setting(0.0, low=-10.0, high=10.0)
     mount_yaw_deg: float = setting(0.0, low=-360.0, high=360.0)

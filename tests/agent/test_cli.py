@@ -1,0 +1,78 @@
+"""The command line: help that is quick and complete, suggestions, and exit codes that scripts can trust."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+
+import pytest
+
+from agent import __version__
+from agent.cli import COMMANDS, command_parser, main
+from agent.exits import BUG, EXIT_CODES, INTERRUPTED
+
+
+def test_every_command_is_there_with_its_help() -> None:
+    for name, (module, summary) in COMMANDS.items():
+        assert importlib.util.find_spec(module), f"{name}: {module} is missing"
+        text = command_parser(name).format_help()
+        assert text.startswith(f"usage: mapquilt {name} ")
+        assert summary[1:] in text
+        assert f"mapquilt {name}" in text.split("examples:")[1] or module.endswith("control")
+
+
+def test_help_imports_no_command_and_no_package() -> None:
+    probe = (
+        "import sys; from agent.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
+        "print([m for m in ('numpy', 'cv2', 'zenoh', 'agent.commands.run') if m in sys.modules], file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=True)
+    assert done.stderr == "[]\n"
+    for name in COMMANDS:
+        assert f"\n  {name} " in done.stdout
+    assert EXIT_CODES in done.stdout
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["--version"])
+    assert end.value.code == 0
+    assert capsys.readouterr().out == f"mapquilt {__version__}\n"
+
+
+def test_an_unknown_command_is_answered_with_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["merg"]) == 2
+    assert capsys.readouterr().err == "mapquilt: unknown command 'merg'; did you mean 'merge'?\n"
+    assert main(["xyzzy"]) == 2
+    assert "--help lists them" in capsys.readouterr().err
+    assert main([]) == 2
+
+
+@pytest.mark.parametrize(
+    ("error", "code"), [(KeyboardInterrupt(), INTERRUPTED), (ValueError("odd"), BUG), (RecursionError("deep"), BUG)]
+)
+def test_whatever_happens_there_is_a_code(
+    error: BaseException, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(_: object) -> int:
+        raise error
+
+    monkeypatch.setattr("agent.commands.config.run", fail)
+    assert main(["config"]) == code
+    said = capsys.readouterr().err
+    assert ("this is a bug of ours" in said) == (code == BUG)
+
+
+def test_global_flags_stand_before_or_behind_the_command(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["-q", "config", "show", "--set", "robot.id=r1"]) == 0
+    before = capsys.readouterr().out
+    assert main(["config", "show", "--set", "robot.id=r1", "-q"]) == 0
+    assert capsys.readouterr().out == before
+
+
+def test_a_reader_that_has_seen_enough_is_no_error() -> None:
+    done = subprocess.run(
+        f"{sys.executable} -m agent config show --json | head -1", shell=True, capture_output=True, text=True, check=True
+    )
+    assert (done.stdout, done.stderr) == ("{\n", "")
