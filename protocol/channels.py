@@ -20,7 +20,7 @@ MAJOR_VERSION = 1
 MAX_PUSH_BYTES = 16_384  # one batch of the network: larger puts are lost whole on slow links
 CHUNK_BYTES = 16_000  # of a large answer; with its envelope still one batch
 MAX_ANSWER_BYTES = 8_388_608  # of a large answer, joined
-_SEAL_BYTES = 128  # room for the security envelope around any message
+MAX_LIST_BYTES = 524_288  # of a thousand statements, or the recipe of a thousand members
 
 
 class Urgency(enum.Enum):
@@ -44,6 +44,7 @@ class Channel:
     is_pushed: bool  # published as a hint; otherwise only answered to queries
     urgency: Urgency
     max_bytes: int  # encoded, as one message
+    max_items: int = 64  # lists and maps inside, and things in any one of them: what unpacking may allocate
     is_express: bool = False  # not batched with others
 
 
@@ -54,8 +55,8 @@ CHANNELS: tuple[Channel, ...] = (
     Channel(4, m.CoarseMap, "coarse", "map/coarse", False, Urgency.DATA_LOW, MAX_ANSWER_BYTES),
     Channel(5, m.FineTiles, "fine", "map/fine/{base}/{target}", False, Urgency.BACKGROUND, MAX_ANSWER_BYTES),
     Channel(6, m.Statement, "edge", "edge/{other}", True, Urgency.DATA_HIGH, 1_024),
-    Channel(7, m.Statements, "edges", "edges", False, Urgency.DATA_HIGH, MAX_ANSWER_BYTES),
-    Channel(8, m.GlobalMeta, "global", "global/meta", True, Urgency.DATA, MAX_ANSWER_BYTES),
+    Channel(7, m.Statements, "edges", "edges", False, Urgency.DATA_HIGH, MAX_LIST_BYTES, 8_192),
+    Channel(8, m.GlobalMeta, "global", "global/meta", True, Urgency.DATA, MAX_LIST_BYTES, 8_192),
     Channel(9, m.GlobalTiles, "globaltiles", "global/tiles/{base}/{target}", False, Urgency.BACKGROUND, MAX_ANSWER_BYTES),
     Channel(10, m.Manifest, "manifest", "", False, Urgency.DATA, 256),
     Channel(11, m.Chunk, "chunk", "blob/{digest}/{index}", False, Urgency.BACKGROUND, MAX_PUSH_BYTES),

@@ -41,7 +41,7 @@ from protocol.tiles import TileDelta
 
 MAGIC = b"MQ"
 HEADER_BYTES = 8
-_MAX_ITEMS = 65_536  # of any one list, map or string of msgpack, and never more than there are bytes
+_MAX_TEXT_BYTES = 1_024  # of any one string
 _CHECKED_BYTES = 2_048  # what we say is read back when it is small: that costs microseconds and finds our own mistakes
 
 _REQUIRED = object()
@@ -187,7 +187,7 @@ def decode(data: bytes) -> m.Message:
         raise RemoteProtocolError(f"message kind {number} is not known here")
     if len(data) > channel.max_bytes:
         raise TooLarge(f"{channel.name}: {len(data)} bytes; {channel.max_bytes} are allowed")
-    message: m.Message = _believe(_unpacked(data[HEADER_BYTES:]), channel.kind)
+    message: m.Message = _believe(_unpacked(data[HEADER_BYTES:], channel.max_items), channel.kind)
     _check_sense(message)
     return message
 
@@ -218,15 +218,26 @@ def _opened(data: bytes) -> int:
     return data[3]
 
 
-def _unpacked(body: bytes) -> Any:
-    """Plain msgpack data; nothing is allocated beyond what the bytes themselves can hold."""
-    cap = min(len(body), _MAX_ITEMS)
+def _unpacked(body: bytes, max_items: int) -> Any:
+    """Plain msgpack data; nothing is allocated beyond what the bytes themselves hold and the channel allows."""
+    containers = 0
+
+    def count(container: Any) -> Any:
+        nonlocal containers
+        containers += 1
+        if containers > max_items:
+            raise ValueError("too many lists and maps")
+        return container
+
+    cap = min(len(body), max_items)
     try:
         return msgpack.unpackb(
             body,
             raw=False,
             strict_map_key=True,
-            max_str_len=cap,
+            list_hook=count,
+            object_hook=count,
+            max_str_len=min(len(body), _MAX_TEXT_BYTES),
             max_bin_len=len(body),
             max_array_len=cap,
             max_map_len=cap,
