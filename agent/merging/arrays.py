@@ -62,7 +62,7 @@ def grid_from_array(cells: ArrayLike, resolution_m: float, name: str) -> Occupan
         raise MapArrayError(f"{name}: a resolution of {resolution_m} m; it must be positive")
     if array.size and not (array.min() >= -1 and array.max() <= 100):
         raise MapArrayError(f"{name}: values from {array.min()} to {array.max()}; -1 is unknown, 0 free, 100 occupied")
-    return OccupancyGrid(_trinary(array), resolution_m)
+    return OccupancyGrid(_trinary(array), resolution_m) if array.size else OccupancyGrid.empty(resolution_m)
 
 
 def _trinary(array: NDArray[np.integer]) -> NDArray[np.int8]:

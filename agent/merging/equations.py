@@ -25,6 +25,8 @@ _OUR_FREE, _OUR_WALL = 0b0101, 0b1010
 _THEIR_FREE, _THEIR_WALL = 0b1001, 0b0110
 _DISAGREE = 0b1100
 
+BIN_COVARIANCE = np.diag([0.2**2, 0.2**2, math.radians(1.0) ** 2])  # a voted transform is known to its bins: 20 cm, 1 degree
+
 
 def match_factor(ours: OccupancyGrid, theirs: OccupancyGrid, T_ours_theirs: SE2) -> MatchFactor:
     """Equations (1) to (3) for their map laid on ours."""

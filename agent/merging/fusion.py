@@ -130,6 +130,7 @@ class _Votes:
         self.surely_free[rows, cols] |= free & ~near_wall
 
     def decided(self) -> FusedMap:
+        cell_m = self.lattice.resolution_m
         some_wall = self.finest_wall != _NO_VOTE
         conflicts = some_wall & self.surely_free
         cells = np.full(self.voters.shape, UNKNOWN, np.int8)
@@ -137,8 +138,23 @@ class _Votes:
         cells[some_wall & (self.finest_wall <= self.finest_free)] = OCCUPIED
         cells[conflicts] = UNKNOWN
         agreements = (self.voters >= 2) & ~conflicts
-        grid = OccupancyGrid(cells, self.lattice.resolution_m, self.lattice.origin)
-        return FusedMap(grid, int(np.count_nonzero(conflicts)), int(np.count_nonzero(agreements)), conflicts, agreements)
+        rows, cols = _bounds(self.voters > 0)
+        corner = SE2((self.lattice.col0 + cols.start) * cell_m, (self.lattice.row0 + rows.start) * cell_m, 0.0)
+        return FusedMap(
+            OccupancyGrid(cells[rows, cols], cell_m, corner),
+            int(np.count_nonzero(conflicts)),
+            int(np.count_nonzero(agreements)),
+            conflicts[rows, cols],
+            agreements[rows, cols],
+        )
+
+
+def _bounds(mask: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """Rows and columns around all True cells; the first cell when there is none."""
+    rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not len(rows):
+        return slice(0, 1), slice(0, 1)
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
 
 
 def _window(lattice: Lattice, corners_m: NDArray[np.float64], margin_m: float) -> tuple[Lattice, slice, slice]:

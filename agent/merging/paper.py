@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 
 from agent.features.paper import FeatureRows, PaperFeatures, paper_features
 from agent.features.snapshot import MapSnapshot
-from agent.merging.equations import Candidate, FactorCounter, overlap_m2
+from agent.merging.equations import BIN_COVARIANCE, Candidate, FactorCounter, overlap_m2
 from agent.merging.paper_guard import choose_guarded
 from agent.merging.result import MatchOptions, MatchStatus, MergeResult, Reason
-from protocol.geometry import SE2
+from protocol.geometry import SE2, wrap_angle
 from protocol.grid import OccupancyGrid
 
 TRANSLATION_BIN_M = 0.2  # the paper's cell
@@ -61,6 +61,7 @@ def match_by_the_paper(ours: OccupancyGrid, theirs: OccupancyGrid, options: Matc
     return MergeResult(
         MatchStatus.MERGED if is_accepted else MatchStatus.NO,
         best.T_ours_theirs,
+        BIN_COVARIANCE,
         factor=best.factor,
         overlap_m2=overlap_m2(best.factor, ours),
         score=best.factor.value,
@@ -118,7 +119,7 @@ def translation_candidates(pairs: SimilarFeatures, theta_rad: float) -> Iterator
     bins = np.rint(shifts_m / TRANSLATION_BIN_M).astype(np.int64)
     for code in _most_frequent(bins[:, 0] * _ROW + bins[:, 1], MAX_TRANSLATIONS):
         x, y = (code + _ROW // 2) // _ROW, (code + _ROW // 2) % _ROW - _ROW // 2
-        yield SE2(x * TRANSLATION_BIN_M, y * TRANSLATION_BIN_M, theta_rad)
+        yield SE2(x * TRANSLATION_BIN_M, y * TRANSLATION_BIN_M, wrap_angle(theta_rad))
 
 
 def _most_frequent(votes: NDArray[np.int64], limit: int) -> list[int]:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.merging.equations import Candidate, overlap_m2
+from agent.merging.equations import BIN_COVARIANCE, Candidate, overlap_m2
 from agent.merging.result import Alternative, MatchOptions, MatchStatus, MergeResult, Reason
 from protocol.geometry import SE2, wrap_angle
 from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
@@ -43,6 +43,7 @@ def choose_guarded(ours: OccupancyGrid, theirs: OccupancyGrid, candidates: list[
     return MergeResult(
         status,
         best.T_ours_theirs,
+        BIN_COVARIANCE,
         factor=best.factor,
         overlap_m2=overlap_m2(best.factor, ours),
         score=weight.score_m,

@@ -160,3 +160,10 @@ def _enclosed(walls: NDArray[np.bool_]) -> NDArray[np.bool_]:
     sides = cv2.filter2D(walls.astype(np.uint8), cv2.CV_8U, cross, borderType=cv2.BORDER_CONSTANT)
     pinholes: NDArray[np.bool_] = np.greater_equal(sides, 3)
     return pinholes
+
+
+def resampled_like(target: OccupancyGrid, grid: OccupancyGrid, T_target_map: SE2) -> NDArray[np.int8]:
+    """Cells of the grid on the lattice of `target`, a fused grid: parallel to its frame, its lines through the origin."""
+    cell_m = target.resolution_m
+    lattice = Lattice(cell_m, round(target.origin.y_m / cell_m), round(target.origin.x_m / cell_m), target.height, target.width)
+    return resampled(grid, T_target_map, lattice)

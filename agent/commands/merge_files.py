@@ -1,0 +1,237 @@
+"""What `mapquilt merge` does with loaded maps: match every pair, lay out those that fit, fuse, draw, and say it.
+
+While matching, every map lives in the frame of its own lower-left corner, as nav_msgs has it; the origins of the YAML files come
+in at the very end, when the transform between the files' own map frames is told and the merged map is written in the first one's.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.features.snapshot import MapSnapshot
+from agent.files import write_atomically
+from agent.fleet.frame_graph import Edge, solve
+from agent.map_files import save_map
+from agent.merging.arrays import at_corner
+from agent.merging.errors import FusionError
+from agent.merging.fusion import FusedMap, fuse
+from agent.merging.matched_features import matched_features
+from agent.merging.matching import match_maps
+from agent.merging.resampling import resampled_like
+from agent.merging.result import MatchOptions, MatchStatus, MergeResult
+from agent.view.merge_picture import MapToDraw, Overlay, merge_picture
+from agent.view.render import png
+from protocol.geometry import SE2
+from protocol.grid import OccupancyGrid
+
+Pair = tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedMap:
+    """A map file's grid, and the same cells in the frame of their lower-left corner."""
+
+    name: str
+    grid: OccupancyGrid
+
+    @cached_property
+    def snapshot(self) -> MapSnapshot:
+        return MapSnapshot.of(at_corner(self.grid))
+
+
+@dataclass(eq=False)
+class Merged:
+    """All pairs tried, and the corner frame of every map that joined the first one."""
+
+    maps: list[LoadedMap]
+    options: MatchOptions
+    results: Mapping[Pair, MergeResult]
+    T_first: Mapping[int, SE2]  # T_first_map, corner frames; the first at identity
+    inconsistent: frozenset[Pair] = frozenset()  # accepted alone, but in contradiction with the others
+    fused: FusedMap | None = field(default=None)  # once written
+
+    @property
+    def is_complete(self) -> bool:
+        return len(self.T_first) == len(self.maps)
+
+    def as_json(self) -> dict[str, Any]:
+        """The first pair at the top; every map and every pair below when there are more than two."""
+        answer = {"method": self.options.method, **self._pair_json((0, 1))}
+        answer["accepted"] = self.is_complete
+        if 1 in self.T_first:
+            answer.update(_xyt(self.T_first[1]), map_frame=_xyt(self._between_files(0, 1, self.T_first[1])))
+        if len(self.maps) > 2:
+            answer["maps"] = [self._map_json(i) for i in range(len(self.maps))]
+            answer["pairs"] = [self._pair_json(pair) for pair in self.results]
+            answer["status"] = str(MatchStatus.MERGED) if self.is_complete else answer["status"]
+        if self.fused is not None:
+            answer["conflicting_cells"] = self.fused.conflicting_cells
+            answer["agreeing_cells"] = self.fused.agreeing_cells
+            answer["consistency"] = round(self.fused.consistency, 5)
+        return answer
+
+    def _map_json(self, i: int) -> dict[str, Any]:
+        T = self.T_first.get(i)
+        placed = {} if T is None else {**_xyt(T), "map_frame": _xyt(self._between_files(0, i, T))}
+        return {"map": self.maps[i].name, "joined": T is not None, **placed}
+
+    def _pair_json(self, pair: Pair) -> dict[str, Any]:
+        result = self.results[pair]
+        T = result.T_ours_theirs
+        known = T is not None
+        return {
+            "a": self.maps[pair[0]].name,
+            "b": self.maps[pair[1]].name,
+            "accepted": result.accepted and pair not in self.inconsistent,
+            "status": str(result.status),
+            "reason": "inconsistent with the other maps" if pair in self.inconsistent else result.reason,
+            **_xyt(T),
+            "covariance": np.round(result.covariance, 10).tolist() if known else None,
+            "score": _rounded(result.score),
+            "runner_up_score": _rounded(result.runner_up_score),
+            "match_factor": _rounded(result.factor.value),
+            "agree_cells": result.factor.agree,
+            "disagree_cells": result.factor.disagree,
+            "overlap_m2": _rounded(result.overlap_m2),
+            "candidates_tried": result.candidates_tried,
+            "evidence": {name: _rounded(value) for name, value in result.evidence.items()},
+            "alternatives": [{**_xyt(other.T_ours_theirs), "score": _rounded(other.score)} for other in result.alternatives],
+            "map_frame": _xyt(self._between_files(*pair, T)) if T is not None else None,
+        }
+
+    def _between_files(self, i: int, j: int, T_corners: SE2) -> SE2:
+        """From corner frames to the map frames of the YAML files."""
+        return self.maps[i].grid.origin @ T_corners @ self.maps[j].grid.origin.inverse()
+
+    def as_text(self) -> str:
+        return "\n".join(f"{self.verdict(pair)} ({', '.join(_figures(result))})" for pair, result in self.results.items())
+
+    def verdict(self, pair: Pair) -> str:
+        """One sentence about a pair."""
+        result = self.results[pair]
+        a, b = (Path(self.maps[i].name).name for i in pair)
+        T = result.T_ours_theirs
+        if pair in self.inconsistent:
+            return f"not merged: {b} fits {a}, but contradicts the other maps"
+        if result.accepted and T is not None:
+            where = f"x {T.x_m:.3f} m, y {T.y_m:.3f} m, {math.degrees(T.theta_rad):.2f} deg"
+            return f"merged: {b} lies on {a} at {where}"
+        kind = "ambiguous" if result.status is MatchStatus.AMBIGUOUS else "not merged"
+        return f"{kind}: {b} on {a}: {result.reason}"
+
+
+def merge_files(maps: list[LoadedMap], options: MatchOptions) -> Merged:
+    """Match every pair; with three maps and more, only edges around which every loop closes count."""
+    pairs = itertools.combinations(range(len(maps)), 2)
+    results = {(i, j): match_maps(maps[i].snapshot, maps[j].snapshot, options) for i, j in pairs}
+    edges = [_edge(pair, result) for pair, result in results.items() if result.accepted]
+    if len(maps) == 2:
+        found = results[0, 1].T_ours_theirs
+        joined = {1: found} if edges and found is not None else {}
+        return Merged(maps, options, results, {0: SE2.identity(), **joined})
+    layout = solve(edges)
+    group = layout.group_of.get(_name(0))
+    frames = group.rerooted(_name(0)).T_root if group else {}
+    T_first = {int(name): T for name, T in frames.items()}
+    inconsistent = frozenset((int(edge.a), int(edge.b)) for edge in layout.rejected)
+    return Merged(maps, options, results, {0: SE2.identity(), **T_first}, inconsistent)
+
+
+def _name(i: int) -> str:
+    return f"{i:04d}"
+
+
+def _edge(pair: Pair, result: MergeResult) -> Edge:
+    assert result.T_ours_theirs is not None
+    c = result.covariance
+    covariance = (c[0, 0], c[0, 1], c[0, 2], c[1, 1], c[1, 2], c[2, 2])
+    i, j = pair
+    return Edge(_name(i), _name(j), result.T_ours_theirs, covariance, result.score, f"{i},{j}".encode())
+
+
+def write_merged(merged: Merged, output: Path, resolution_m: float | None) -> list[Path]:
+    """The fused map in the first map's frame, and a picture of every pair that has a hypothesis; returns what was written."""
+    base = output.with_suffix("") if output.suffix in (".yaml", ".yml", ".pgm", ".png") else output
+    written: list[Path] = []
+    if len(merged.T_first) > 1:
+        merged.fused = _fused_in_first_frame(merged, resolution_m)
+        written += save_map(merged.fused.grid, base)
+    for i, j in merged.results:
+        name = base.name if len(merged.maps) == 2 else f"{base.name}-{i + 1}-{j + 1}"
+        path = base.with_name(f"{name}.png")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, png(pair_picture(merged, (i, j))))
+        written.append(path)
+    return written
+
+
+def _fused_in_first_frame(merged: Merged, resolution_m: float | None) -> FusedMap:
+    """On the first map's own lattice, so that its cells stay as they are; a map whose frame is turned is drawn upright."""
+    first = merged.maps[0].grid.origin
+    T_lattice_corner = SE2.identity() if first.theta_rad == 0 else first
+    laid = [(at_corner(merged.maps[i].grid), T_lattice_corner @ T) for i, T in sorted(merged.T_first.items())]
+    fused = fuse(laid, resolution_m)
+    if first.theta_rad != 0:
+        return fused
+    return replace(fused, grid=replace(fused.grid, origin=first @ fused.grid.origin))
+
+
+def pair_picture(merged: Merged, pair: Pair) -> NDArray[np.uint8]:
+    """Before and after: both maps with their features, and theirs laid on ours at the best hypothesis."""
+    a, b = (merged.maps[i] for i in pair)
+    result = merged.results[pair]
+    T = result.T_ours_theirs
+    if T is None:
+        return merge_picture(_to_draw(a, {}), _to_draw(b, {}), None, merged.verdict(pair), _figures(result))
+    same = matched_features(a.snapshot.features, b.snapshot.features, T)
+    kinds = {"lines": same.lines, "circles": same.circles, "arcs": same.arcs, "curves": same.curves}
+    longest_first = np.argsort(-a.snapshot.features.lines[same.lines[:, 0], 3], kind="stable")
+    kinds["lines"] = same.lines[longest_first]
+    ours = _to_draw(a, {kind: rows[:, 0].tolist() for kind, rows in kinds.items()})
+    theirs = _to_draw(b, {kind: rows[:, 1].tolist() for kind, rows in kinds.items()})
+    return merge_picture(
+        ours, theirs, _overlay(a, b, T), merged.verdict(pair), [*_figures(result), f"{len(same)} matched features"]
+    )
+
+
+def _to_draw(loaded: LoadedMap, matched: Mapping[str, list[int]]) -> MapToDraw:
+    everything = {kind: matched.get(kind, []) for kind in ("lines", "circles", "arcs", "curves")}
+    return MapToDraw(Path(loaded.name).name, loaded.snapshot.grid, loaded.snapshot.features, everything)
+
+
+def _overlay(a: LoadedMap, b: LoadedMap, T: SE2) -> Overlay | None:
+    ours, theirs = a.snapshot.grid, b.snapshot.grid
+    try:
+        fused = fuse([(ours, SE2.identity()), (theirs, T)])
+    except FusionError:  # a rejected hypothesis may lie kilometres away: nothing to see there
+        return None
+    cells = [resampled_like(fused.grid, grid, T_frame) for grid, T_frame in ((ours, SE2.identity()), (theirs, T))]
+    return Overlay(fused.grid, cells[0], cells[1], fused.conflicts, SE2.identity(), T)
+
+
+def _figures(result: MergeResult) -> list[str]:
+    factor = result.factor
+    return [
+        f"match factor {factor.value:.3f}",
+        f"overlap {result.overlap_m2:.0f} m2",
+        f"score {result.score:.1f}, runner-up {result.runner_up_score:.1f}",
+    ]
+
+
+def _xyt(T: SE2 | None) -> dict[str, float | None]:
+    if T is None:
+        return {"x": None, "y": None, "theta": None}
+    return {"x": round(T.x_m, 6), "y": round(T.y_m, 6), "theta": round(T.theta_rad, 8)}
+
+
+def _rounded(value: float) -> float | None:
+    return round(float(value), 6) if math.isfinite(value) else None
