@@ -83,8 +83,8 @@ class CoarseField:
         return total.reshape(len(turns), len(shifts), len(shifts)) / (255.0 * len(points))
 
 
-def coarse_points(points_m: NDArray[np.float32]) -> NDArray[np.float32]:
+def coarse_points(points_m: NDArray[np.float32], voxel_m: float = POINT_VOXEL_M) -> NDArray[np.float32]:
     """One point a coarse voxel."""
-    keys = np.floor(points_m / POINT_VOXEL_M).astype(np.int64)
+    keys = np.floor(points_m / voxel_m).astype(np.int64)
     _, first = np.unique(keys[:, 0] * 1_000_003 + keys[:, 1], return_index=True)
     return points_m[np.sort(first)]

@@ -41,7 +41,7 @@ class MapEstimate:
     grid: OccupancyGrid
     T_map_robot: SE2  # at `stamp_s`
     revision: int  # grows whenever a cell may have changed
-    epoch: int  # grows when a new local map was started or the whole map was redrawn: revisions start again
+    epoch: int  # grows when a new local map was started: another frame, revisions start again
     effective_particles: float
     status: MapperStatus
     T_map_odom: SE2  # T_map_odom @ (newest odometry) is where the robot is now

@@ -134,9 +134,17 @@ class TiledFields:
             unused = np.flatnonzero(self.owners[1:] == 0) + 1
         return unused[:n]
 
+    def put(self, tables: Ints, tiles: NDArray[np.uint8], first_tile: Ints) -> None:
+        """Take over stored tables and tiles."""
+        self.tables, self.pool, self.first_tile = tables, tiles, first_tile
+        self._count_owners()
+
     def resample(self, ancestors: Ints) -> None:
         """Particle i becomes a copy of particle ancestors[i]: tables are copied, tiles are shared."""
         self.tables = np.ascontiguousarray(self.tables[ancestors])
+        self._count_owners()
+
+    def _count_owners(self) -> None:
         self.owners = np.bincount(self.tables.ravel(), minlength=len(self.pool)).astype(np.int64)
         self.owners[0] = 0
 

@@ -93,6 +93,30 @@ class LogOddsGrid:
             rows[0] // TILE_CELLS : rows[-1] // TILE_CELLS + 1, cols[0] // TILE_CELLS : cols[-1] // TILE_CELLS + 1
         ] = self.revision
 
+    def is_free(self, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """(N,) whether map-frame points lie in cells known to be free."""
+        cells = np.floor(points_m[:, ::-1] / self.resolution_m).astype(np.int64) - self.first_tile * TILE_CELLS
+        inside = (cells >= 0).all(axis=1) & (cells < self.cells.shape).all(axis=1)
+        free = np.zeros(len(points_m), bool)
+        free[inside] = self.cells[cells[inside, 0], cells[inside, 1]] <= self.free_to
+        return free
+
+    def copy(self) -> LogOddsGrid:
+        twin = LogOddsGrid(self.resolution_m)
+        twin.occupied_from, twin.free_to, twin.first_tile = self.occupied_from, self.free_to, self.first_tile.copy()
+        twin.cells, twin.revision, twin.tile_revisions = self.cells.copy(), self.revision, self.tile_revisions.copy()
+        return twin
+
+    def replace_by(self, other: LogOddsGrid) -> None:
+        """Take over the cells of another grid; only tiles whose cells differ count as changed."""
+        for a, b in ((self, other), (other, self)):
+            low = b.first_tile * TILE_CELLS
+            a._cover(low, low + b.cells.shape)
+        tiles = (self.cells != other.cells).reshape(len(self.tile_revisions), TILE_CELLS, -1, TILE_CELLS)
+        self.revision += 1
+        self.tile_revisions[tiles.any(axis=(1, 3))] = self.revision
+        self.cells = other.cells
+
     def trinary(self) -> OccupancyGrid:
         """Occupied, free and unknown cells; the grid's corner lies on a tile corner of the map frame."""
         table = np.full(256, UNKNOWN, np.int8)

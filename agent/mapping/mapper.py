@@ -1,12 +1,12 @@
 """One robot's map: odometry and scans in, a grid and a pose in it out.
 
-    add_scan:  points, motion undone          scan_points.py
-               where is the robot now?        tracking.py, every scan
-               moved far enough?              then, and only then:
-                   all particles              particle_filter.py
-                   the grid of the best one   log_odds.py
+    add_scan:  points, motion undone              scan_points.py
+               where is the robot now?            local_map.py, every scan
+               does what it sees contradict?      then nothing is drawn; carried away?  relocalization.py
+               moved far enough?                  then, and only then, the map is updated
 
-Readings come in order of time.  The same readings and the same seed give the same map, to the bit.
+A robot that finds itself nowhere on its map begins a new one, in a new frame, with the next epoch.  Readings come in order
+of time.  The same readings and the same seed give the same map, to the bit.
 """
 
 from __future__ import annotations
@@ -14,24 +14,28 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from agent.mapping.correlation import CoarseField
+from agent.mapping import checkpoint
 from agent.mapping.estimate import MapEstimate, MapperStatus, ScanOutcome
-from agent.mapping.log_odds import TILE_CELLS, LogOddsGrid
+from agent.mapping.local_map import LocalMap, as_pose
+from agent.mapping.log_odds import TILE_CELLS
 from agent.mapping.motion import Motion, OdometryTrack
 from agent.mapping.options import MappingOptions
-from agent.mapping.particle_filter import ParticleFilter
+from agent.mapping.relocalization import Relocalization
 from agent.mapping.scan_matching import UNCONSTRAINED_RATIO
-from agent.mapping.scan_points import ScanPoints, laser_position_m, scan_points
-from agent.mapping.tracking import Tracked, track
+from agent.mapping.scan_points import ScanPoints, reference_stamp_s, scan_points
+from agent.mapping.tracking import GOOD_FRACTION, Tracked
 from hw.readings import LaserScan, Odometry
-from protocol.geometry import SE2, wrap_angle
 from protocol.grid import OccupancyGrid
 
 FEWEST_POINTS = 20  # fewer returns than this say nothing about where the robot is
-LOST_FRACTION = 0.35  # a scan that fits worse than this is not believed
-UNKNOWN_MOTION = (0.5, 0.4)  # one sigma, metres and radians, when odometry says nothing
+CONTRADICTED = 0.35  # share of a scan that ends in known free space: a crowd of people stays below
+LOST_AFTER = 5  # scans in a row that contradict the map before the robot looks for itself elsewhere
+CONFIRMED_AFTER = 5  # scans in a row that fit, after it found itself, before it draws again
+NEW_MAP_AFTER_S = 10.0  # of looking everywhere in vain
+STUCK_AFTER = 3  # identical scans in a row, while the wheels turn
+STUCK_MOVED_M = 0.05
+STUCK_TURNED_RAD = 0.05
 
 
 class Mapper:
@@ -39,133 +43,150 @@ class Mapper:
 
     def __init__(self, options: MappingOptions, seed: int) -> None:
         self.options = options
-        self.seed = seed
+        self.rng = np.random.default_rng(seed)
         self.odometry = OdometryTrack(options.max_speed_m_s, options.max_turn_rad_s)
-        self.filter = ParticleFilter(options.particles, options.resolution_m, np.random.default_rng(seed))
-        self.coarse = CoarseField()
-        self.grid = LogOddsGrid(options.resolution_m, options.occupied_above, options.free_below)
+        self.map = LocalMap(options, self.rng)
         self.epoch = 0
         self.status = MapperStatus.STARTING
-        self.pose = np.zeros(3)  # T_map_robot at last_scan_s
-        self.last_scan_s = math.nan
-        self.keyframe_pose = np.zeros(3)  # the best particle's pose when it last drew
-        self.keyframe_s = math.nan
-        self.keyframe_deviation = np.zeros(2)  # variances of the motion since then
-        self.best = 0  # the particle that is tracked and drawn
-        self.scans: list[tuple[float, int, SE2]] = []  # stamp, keyframe, pose relative to that keyframe
+        self.contradictions = 0  # scans in a row
+        self.confirmations_missing = 0  # scans that must fit before drawing goes on
+        self.lost_since_s = math.nan
+        self.search: Relocalization | None = None
+        self.last_ranges = np.zeros(0, np.float32)
+        self.repeats = 0  # scans in a row that equal last_ranges
+        self.repeats_since_s = math.nan
 
     def add_odometry(self, odometry: Odometry) -> None:
+        """Samples in order of time; a clock that starts again is a new beginning of the odometry."""
         self.odometry.add(odometry)
 
     def add_scan(self, scan: LaserScan) -> ScanOutcome:
         """Track one scan, and draw it when it is a keyframe."""
         points = scan_points(scan, self.odometry, self.options)
-        if len(points.matching_m) < FEWEST_POINTS:
-            return self._outcome(MapperStatus.BLIND, False, 0.0, f"only {len(points.matching_m)} returns in a scan")
-        if self.status is MapperStatus.STARTING:
-            return self._first_scan(points)
-        motion = self.odometry.motion_between(self.last_scan_s, points.stamp_s)
-        tracked, deviation = self._track(motion, points)
-        self.last_scan_s = points.stamp_s
-        if tracked.fraction < LOST_FRACTION:
-            self.pose = self._predicted(motion)
-            return self._outcome(
-                MapperStatus.LOST, False, tracked.fraction, f"only {tracked.fraction:.0%} of the scan fits the map"
+        if self._is_stuck(scan):
+            return self._held(
+                points, MapperStatus.STUCK, 0.0, "the LIDAR repeats one scan while the wheels turn: unplug and replug it"
             )
-        self.pose = tracked.pose
-        self.keyframe_deviation += np.square(deviation)
-        is_keyframe = self._is_keyframe(points.stamp_s)
+        if len(points.matching_m) < FEWEST_POINTS:
+            return self._held(
+                points, MapperStatus.BLIND, 0.0, f"only {len(points.matching_m)} of {len(scan.ranges_m)} beams returned"
+            )
+        if self.map.is_empty:
+            self.map.start(points)
+            return self._outcome(MapperStatus.TRACKING, True, 1.0)
+        if self.search is not None or not math.isnan(self.lost_since_s):
+            return self._look_everywhere(points)
+        return self._follow(points)
+
+    def _follow(self, points: ScanPoints) -> ScanOutcome:
+        """The ordinary case: the robot is near where its wheels say."""
+        motion = self._motion(points)
+        tracked = self.map.track(motion, points)
+        if tracked.fraction < GOOD_FRACTION and self._contradiction(points, tracked) > CONTRADICTED:
+            return self._contradicted(points, tracked)
+        self.contradictions = 0
+        self.map.note_motion(motion)
+        self.confirmations_missing = max(self.confirmations_missing - 1, 0)
+        is_keyframe = self.confirmations_missing == 0 and self.map.is_keyframe(points.stamp_s, tracked.pose)
         if is_keyframe:
-            self._update_map(points)
-        self._note_pose(points.stamp_s)
-        status = MapperStatus.TRACKING if tracked.weakest >= UNCONSTRAINED_RATIO else MapperStatus.UNCONSTRAINED
-        return self._outcome(status, is_keyframe, tracked.fraction, "")
+            self.map.update(points, tracked.pose)
+        self.map.accept(points.stamp_s, self.map.keyframe_pose.copy() if is_keyframe else tracked.pose)
+        is_open = tracked.weakest < UNCONSTRAINED_RATIO
+        status = MapperStatus.UNCONSTRAINED if is_open else MapperStatus.TRACKING
+        return self._outcome(status, is_keyframe, tracked.fraction)
 
-    def _first_scan(self, points: ScanPoints) -> ScanOutcome:
-        self.filter.start(points.surface_m)
-        self._draw(points)
-        self.last_scan_s = self.keyframe_s = points.stamp_s
-        self._note_pose(points.stamp_s)
-        return self._outcome(MapperStatus.TRACKING, True, 1.0, "")
+    def _motion(self, points: ScanPoints) -> Motion:
+        """Since the last accepted scan: by the wheels, or as before when there are no wheels."""
+        if self.odometry.stamps_s:
+            return self.odometry.motion_between(self.map.last_scan_s, points.stamp_s)
+        return self.map.steady_motion(points.stamp_s)
 
-    def _predicted(self, motion: Motion) -> NDArray[np.float64]:
-        return as_array(as_pose(self.pose) @ motion.T_from_to)
+    def _contradiction(self, points: ScanPoints, tracked: Tracked) -> float:
+        """Share of the scan's points that lie in space known to be free: new rooms are no contradiction, moved walls are."""
+        seen = self.map.drawing.grid.is_free(as_pose(tracked.pose).apply(points.matching_m))
+        return float(np.mean(seen & (tracked.likelihood < 0.1)))
 
-    def _track(self, motion: Motion, points: ScanPoints) -> tuple[Tracked, tuple[float, float]]:
-        """The tracked pose, and one sigma of the motion that led there."""
-        step = math.hypot(motion.T_from_to.x_m, motion.T_from_to.y_m), abs(motion.T_from_to.theta_rad)
-        deviation = self.options.motion_noise.deviations(motion.T_from_to)
-        if not motion.is_known:
-            step, deviation = UNKNOWN_MOTION, UNKNOWN_MOTION
-        fields = self.filter.fields
-        predicted = self._predicted(motion)
-        return track(fields, self.best, self.coarse, predicted, step, deviation, points.matching_m), deviation
+    def _contradicted(self, points: ScanPoints, tracked: Tracked) -> ScanOutcome:
+        self.contradictions += 1
+        if self.contradictions >= LOST_AFTER:
+            self.contradictions = 0
+            self.lost_since_s = points.stamp_s
+        return self._held(points, MapperStatus.LOST, tracked.fraction, f"only {tracked.fraction:.0%} of the scan fits the map")
 
-    def _is_keyframe(self, stamp_s: float) -> bool:
-        moved_m = math.hypot(*(self.pose - self.keyframe_pose)[:2])
-        turned_rad = abs(wrap_angle(self.pose[2] - self.keyframe_pose[2]))
-        return (
-            moved_m >= self.options.keyframe_distance_m
-            or turned_rad >= self.options.keyframe_angle_rad
-            or stamp_s - self.keyframe_s >= self.options.keyframe_interval_s
+    def _look_everywhere(self, points: ScanPoints) -> ScanOutcome:
+        """Lost: a few headings of the search per scan; found, or after a while a new map."""
+        if self.search is None:
+            self.search = self.map.search_for(points.matching_m, points.stamp_s)
+        self.search.step()
+        if self.search.is_done:
+            found = self.search.answer(self.map.filter.fields, self.map.filter.followed)
+            if found is not None:
+                self.map.move_to(found, self.search.stamp_s)
+                self.search, self.lost_since_s = None, math.nan
+                self.confirmations_missing = CONFIRMED_AFTER
+                return self._follow(points)
+            self.search = None
+            if points.stamp_s - self.lost_since_s > NEW_MAP_AFTER_S:
+                return self._begin_anew(points)
+        return self._held(points, MapperStatus.LOST, 0.0, "lost: looking for this place on the whole map; nothing is drawn")
+
+    def _begin_anew(self, points: ScanPoints) -> ScanOutcome:
+        self.epoch += 1
+        self.map = LocalMap(self.options, self.rng)
+        self.lost_since_s = math.nan
+        self.map.start(points)
+        return self._outcome(
+            MapperStatus.TRACKING, True, 1.0, f"this place is not on the map: a new local map begins, epoch {self.epoch}"
         )
 
-    def _update_map(self, points: ScanPoints) -> None:
-        """Algorithm of particle_filter.py, then the grid of the best particle."""
-        motion = as_array(as_pose(self.keyframe_pose).inverse() @ as_pose(self.pose))
-        deviation_m, deviation_rad = np.sqrt(self.keyframe_deviation)
-        self.filter.update(motion, (float(deviation_m), float(deviation_rad)), points.matching_m, points.surface_m)
-        self.best = self.filter.best()
-        self.pose = self.filter.poses[self.best].copy()
-        self.keyframe_s = points.stamp_s
-        self._draw(points)
+    def _is_stuck(self, scan: LaserScan) -> bool:
+        """The same numbers again and again, though the wheels turn."""
+        if not np.array_equal(scan.ranges_m, self.last_ranges, equal_nan=True):
+            self.last_ranges, self.repeats, self.repeats_since_s = scan.ranges_m, 0, reference_stamp_s(scan)
+            return False
+        self.repeats += 1
+        if self.repeats < STUCK_AFTER:
+            return False
+        motion = self.odometry.motion_between(self.repeats_since_s, reference_stamp_s(scan)).T_from_to
+        return math.hypot(motion.x_m, motion.y_m) > STUCK_MOVED_M or abs(motion.theta_rad) > STUCK_TURNED_RAD
 
-    def _draw(self, points: ScanPoints) -> None:
-        """The scan into the grid and the coarse field, from where the best particle stands."""
-        T_map_robot = as_pose(self.pose)
-        self.keyframe_pose, self.keyframe_deviation = self.pose.copy(), np.zeros(2)
-        laser_m = laser_position_m(self.options, T_map_robot)
-        self.grid.add(laser_m, T_map_robot.apply(points.points_m), points.is_hit, clears=not points.is_partial)
-        self.coarse.stamp(T_map_robot.apply(points.matching_m).astype(np.float32))
+    def _held(self, points: ScanPoints, status: MapperStatus, fraction: float, reason: str) -> ScanOutcome:
+        """A scan that is not believed: the pose is what the wheels say, and nothing is drawn."""
+        if self.map.is_empty:
+            return ScanOutcome(status, as_pose(self.map.pose), False, fraction, reason)
+        self.status = status
+        return ScanOutcome(status, as_pose(self.map.predicted(self._motion(points))), False, fraction, reason)
 
-    def _note_pose(self, stamp_s: float) -> None:
-        relative = as_pose(self.keyframe_pose).inverse() @ as_pose(self.pose)
-        self.scans.append((stamp_s, len(self.filter.path) - 1, relative))
-
-    def trajectory(self) -> NDArray[np.float64]:
-        """(N, 4) stamp, x, y, theta of the robot at every tracked scan, as the best particle remembers it now."""
-        keyframes = self.filter.path_of(self.best)
-        poses = [(stamp_s, as_pose(keyframes[k]) @ relative) for stamp_s, k, relative in self.scans]
-        return np.array([[stamp_s, pose.x_m, pose.y_m, pose.theta_rad] for stamp_s, pose in poses]).reshape(-1, 4)
-
-    def _outcome(self, status: MapperStatus, is_keyframe: bool, fraction: float, reason: str) -> ScanOutcome:
-        if self.status is not MapperStatus.STARTING or is_keyframe:
-            self.status = status
-        return ScanOutcome(status, as_pose(self.pose), is_keyframe, fraction, reason)
+    def _outcome(self, status: MapperStatus, is_keyframe: bool, fraction: float, reason: str = "") -> ScanOutcome:
+        self.status = status
+        return ScanOutcome(status, as_pose(self.map.pose), is_keyframe, fraction, reason)
 
     def estimate(self) -> MapEstimate:
         """The map and the pose as they are now; the grid is a copy."""
-        T_map_robot = as_pose(self.pose)
-        T_odom_robot = None if math.isnan(self.last_scan_s) else self.odometry.pose_at(self.last_scan_s)
-        is_empty = self.grid.revision == 0
+        grid, stamp_s = self.map.drawing.grid, self.map.last_scan_s
+        T_map_robot = as_pose(self.map.pose)
+        T_odom_robot = None if self.map.is_empty else self.odometry.pose_at(stamp_s)
         return MapEstimate(
-            grid=OccupancyGrid.empty(self.options.resolution_m) if is_empty else self.grid.trinary(),
+            grid=OccupancyGrid.empty(self.options.resolution_m) if self.map.is_empty else grid.trinary(),
             T_map_robot=T_map_robot,
-            revision=self.grid.revision,
+            revision=grid.revision,
             epoch=self.epoch,
-            effective_particles=self.filter.effective_particles(),
+            effective_particles=self.map.filter.effective_particles(),
             status=self.status,
             T_map_odom=T_map_robot if T_odom_robot is None else T_map_robot @ T_odom_robot.inverse(),
-            stamp_s=self.last_scan_s,
+            stamp_s=stamp_s,
             tile_cells=TILE_CELLS,
-            first_tile=(int(self.grid.first_tile[0]), int(self.grid.first_tile[1])),
-            tile_revisions=self.grid.tile_revisions.copy(),
+            first_tile=(int(grid.first_tile[0]), int(grid.first_tile[1])),
+            tile_revisions=grid.tile_revisions.copy(),
         )
 
+    def checkpoint(self) -> bytes:
+        """Everything the future depends on: a restored mapper goes on to the identical map."""
+        return checkpoint.pack(self)
 
-def as_pose(xyt: NDArray[np.float64]) -> SE2:
-    return SE2(float(xyt[0]), float(xyt[1]), wrap_angle(float(xyt[2])))
-
-
-def as_array(pose: SE2) -> NDArray[np.float64]:
-    return np.array([pose.x_m, pose.y_m, pose.theta_rad])
+    @staticmethod
+    def restore(data: bytes, options: MappingOptions) -> Mapper:
+        """The mapper of `checkpoint`; raises `CheckpointError` when the bytes or the options do not fit."""
+        mapper = Mapper(options, seed=0)
+        checkpoint.unpack(data, mapper)
+        return mapper

@@ -23,6 +23,8 @@ RANDOM_HIT = 0.05  # share of beams that nothing on the map explains
 WEIGHT_GAIN = 0.03  # of each point's log-likelihood; stronger gains kill the right particle on one noisy scan
 SPREAD_GAIN = 0.02  # of the fit's covariance, when drawing around the mode
 PREDICTION_NOISE = np.array([0.01, 0.01, 0.004])  # metres, metres, radians: what keeps the particles apart
+CLEARLY_LIKELIER = 1.0  # in log-weight: the drawn map should not flip between particles that are as good
+KEPT_KEYFRAMES = 4096  # particles agree on what lies further back than half of this
 RESAMPLE_BELOW = 0.5  # effective particles, as a share of all
 
 
@@ -37,14 +39,14 @@ class ParticleFilter:
         self.path: list[Poses] = []  # poses at every keyframe so far
         self.parents: list[NDArray[np.uint8]] = []  # particle i of keyframe k came from particle parents[k][i] of k - 1
         self.next_parents = np.arange(particles, dtype=np.uint8)
+        self.followed = 0  # the particle that is tracked and drawn
+        self.lineage: list[int] = []  # its ancestor at every keyframe ...
+        self.line: Poses = np.empty((0, 3))  # ... and where that one was
+        self.forgotten = 0  # keyframe number of path[0]: nobody turns back further than that
 
     @property
     def particles(self) -> int:
         return len(self.poses)
-
-    def best(self) -> int:
-        """The most likely particle."""
-        return int(np.argmax(self.log_weights))
 
     def effective_particles(self) -> float:
         weights = self.weights()
@@ -59,6 +61,7 @@ class ParticleFilter:
         self._cover(surface_m)
         self._stamp(surface_m)
         self._remember()
+        self._follow()
 
     def update(
         self,
@@ -81,13 +84,14 @@ class ParticleFilter:
         self._stamp(surface_m)
         self._remember()
         self._resample_when_needed()
+        self._follow()
         return fit
 
     def _spread(self, fit: Fit, prior: NDArray[np.float64]) -> Poses:
         """Small steps around each mode, as wide as the fit is soft; none for the best particle."""
         covariance = SPREAD_GAIN * np.linalg.inv(fit.curvature + prior)
         steps = np.einsum("pij,pj->pi", np.linalg.cholesky(covariance), self.rng.standard_normal((self.particles, 3)))
-        steps[self.best()] = 0.0
+        steps[np.argmax(self.log_weights)] = 0.0
         return np.asarray(steps)
 
     def _weigh(self, fit: Fit) -> None:
@@ -112,19 +116,29 @@ class ParticleFilter:
         if self.effective_particles() >= RESAMPLE_BELOW * self.particles:
             return
         ancestors = systematic(self.weights(), self.rng.random())
+        self.followed = heir(ancestors, self.followed)
         self.poses = self.poses[ancestors]
         self.fields.resample(ancestors)
         self.log_weights = np.zeros(self.particles)
         self.next_parents = ancestors.astype(np.uint8)
 
-    def path_of(self, particle: int) -> Poses:
-        """(K, 3) where a particle was at every keyframe, followed back through its ancestors."""
-        poses = np.empty((len(self.path), 3))
-        particle = int(self.next_parents[particle])
-        for k in range(len(self.path) - 1, -1, -1):
-            poses[k] = self.path[k][particle]
-            particle = int(self.parents[k][particle])
-        return poses
+    def _follow(self) -> None:
+        """Stay with the followed particle while none is clearly likelier, and keep its lineage."""
+        best = int(np.argmax(self.log_weights))
+        if self.log_weights[best] > self.log_weights[self.followed] + CLEARLY_LIKELIER:
+            self.followed = best
+        particle = int(self.next_parents[self.followed])
+        self.lineage.append(particle)
+        self.line = np.vstack([self.line, self.path[-1][particle]])
+        for k in range(len(self.path) - 2, -1, -1):
+            particle = int(self.parents[k + 1][particle])
+            if self.lineage[k + self.forgotten] == particle:
+                break
+            self.lineage[k + self.forgotten] = particle
+            self.line[k + self.forgotten] = self.path[k][particle]
+        if len(self.path) > KEPT_KEYFRAMES:
+            del self.path[: KEPT_KEYFRAMES // 2], self.parents[: KEPT_KEYFRAMES // 2]
+            self.forgotten += KEPT_KEYFRAMES // 2
 
 
 def moved(poses: Poses, motion: NDArray[np.float64]) -> Poses:
@@ -135,6 +149,11 @@ def moved(poses: Poses, motion: NDArray[np.float64]) -> Poses:
     out[:, 1] += sin * motion[..., 0] + cos * motion[..., 1]
     out[:, 2] += motion[..., 2]
     return out
+
+
+def heir(ancestors: NDArray[np.int64], particle: int) -> int:
+    """The first copy of a particle among the resampled, or of the next one that lived on."""
+    return min(int(np.searchsorted(ancestors, particle)), len(ancestors) - 1)
 
 
 def systematic(weights: NDArray[np.float64], offset: float) -> NDArray[np.int64]:

@@ -1,8 +1,9 @@
 """Where a scan fits: Gauss-Newton on the likelihood field, for one pose or for all particles at once.
 
 Maximises  sum_i L(T p_i)  -  1/2 (x - prior)' W (x - prior)   over the pose x = (x, y, theta); L is the field, a Gaussian
-of the distance to the nearest wall, and W what odometry knows.  The sum's curvature H says what the walls determine: where its weakest eigenvalue is a small part
-of the strongest, the geometry leaves that direction open (a corridor) and the prior decides.
+of the distance to the nearest wall, and W what odometry knows.  The curvature H of the sum says what the walls determine:
+where its weakest eigenvalue is a small part of the strongest, the geometry leaves that direction open (a corridor) and the
+prior decides.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ def curvature_of(fields: TiledFields, value: NDArray[np.float32], jacobian: NDAr
     """
     slope = jacobian[:, 0] ** 2 + jacobian[:, 1] ** 2 + FLAT_SLOPE**2
     stiffness = value / (slope * np.float32(fields.sigma_m**2))
-    return np.einsum("pim,pjm->pij", jacobian * stiffness[:, None], jacobian).astype(np.float64)
+    return np.asarray(np.einsum("pim,pjm->pij", jacobian * stiffness[:, None], jacobian), np.float64)
 
 
 def linearised(

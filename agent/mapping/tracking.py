@@ -30,6 +30,7 @@ class Tracked:
 
     pose: NDArray[np.float64]  # (3,) T_map_robot
     fraction: float  # mean field value under the scan, 0 to 1
+    likelihood: NDArray[np.float32]  # (M,) field value under every point
     curvature: NDArray[np.float64]  # (3, 3) of the walls alone
     weakest: float  # ratio of weakest to strongest direction
 
@@ -77,4 +78,4 @@ def best_fit(
     fractions = fit.fractions()
     i = int(np.argmax(fractions))
     ratio, _ = weakest_direction(fit.curvature[i])
-    return Tracked(fit.poses[i], float(fractions[i]), fit.curvature[i], ratio)
+    return Tracked(fit.poses[i], float(fractions[i]), fit.likelihood[i], fit.curvature[i], ratio)

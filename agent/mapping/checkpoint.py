@@ -1,0 +1,236 @@
+"""A mapper as bytes, and back: what the future of the map depends on, nothing else.
+
+    magic "MQMC" | version u16 | sha256 of the rest | zlib( length u32 | JSON: scalars and array shapes | arrays, raw )
+
+The drawing in progress is not stored: it is drawn again from the stored scans, to the same cell.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import struct
+import zlib
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from agent.mapping.estimate import MapperStatus
+from agent.mapping.likelihood import AREA
+from agent.mapping.log_odds import LogOddsGrid
+from agent.mapping.redrawing import Drawing, DrawnScan
+
+if TYPE_CHECKING:
+    from agent.mapping.mapper import Mapper
+
+MAGIC = b"MQMC"
+VERSION = 1
+LARGEST_BYTES = 1 << 30  # unpacked; a map of a square kilometre stays below
+DTYPES = {"bool", "uint8", "int8", "int32", "int64", "float32", "float64"}
+
+State = dict[str, Any]
+
+
+class CheckpointError(ValueError):
+    """These bytes are not a checkpoint that these options can go on from."""
+
+
+def pack(mapper: Mapper) -> bytes:
+    """One self-checking block."""
+    arrays = state_of(mapper)
+    scalars = {key: value for key, value in arrays.items() if not isinstance(value, np.ndarray)}
+    arrays = {key: value for key, value in arrays.items() if isinstance(value, np.ndarray)}
+    shapes = [[key, str(value.dtype), list(value.shape)] for key, value in arrays.items()]
+    head = json.dumps({"scalars": scalars, "arrays": shapes}).encode()
+    body = zlib.compress(
+        b"".join([struct.pack("<I", len(head)), head, *(np.ascontiguousarray(a).tobytes() for a in arrays.values())]), 1
+    )
+    return MAGIC + struct.pack("<H", VERSION) + hashlib.sha256(body).digest() + body
+
+
+def unpack(data: bytes, mapper: Mapper) -> None:
+    """Fill a new mapper; raises CheckpointError and leaves it unusable when the bytes are not sound."""
+    try:
+        put_state(mapper, opened(data))
+    except CheckpointError:
+        raise
+    except (ValueError, KeyError, TypeError, IndexError, struct.error, zlib.error, RecursionError, OverflowError) as error:
+        raise CheckpointError(f"the saved map is damaged: {error}") from error
+
+
+def opened(data: bytes) -> State:
+    """Scalars and arrays by name."""
+    if data[:4] != MAGIC:
+        raise CheckpointError("the saved map does not begin like one")
+    (version,) = struct.unpack("<H", data[4:6])
+    if version != VERSION:
+        raise CheckpointError(f"the saved map has format {version}, this program reads {VERSION}")
+    if hashlib.sha256(data[38:]).digest() != data[6:38]:
+        raise CheckpointError("the saved map is damaged: its checksum is wrong")
+    unpacked = zlib.decompressobj().decompress(data[38:], LARGEST_BYTES)
+    (length,) = struct.unpack("<I", unpacked[:4])
+    head = json.loads(unpacked[4 : 4 + length])
+    state: State = dict(head["scalars"])
+    at = 4 + length
+    for key, dtype, shape in head["arrays"]:
+        if dtype not in DTYPES or any(not 0 <= n < LARGEST_BYTES for n in shape):
+            raise CheckpointError(f"the saved map is damaged: array {key!r} of {dtype} {shape}")
+        count = math.prod(shape)
+        state[key] = np.frombuffer(unpacked, dtype, count, at).reshape(shape).copy()
+        at += state[key].nbytes
+    return state
+
+
+def state_of(mapper: Mapper) -> State:
+    """Everything, flat."""
+    local = mapper.map
+    return {
+        "resolution_m": mapper.options.resolution_m,
+        "rng": mapper.rng.bit_generator.state,
+        "epoch": mapper.epoch,
+        "status": mapper.status.value,
+        "contradictions": mapper.contradictions,
+        "confirmations_missing": mapper.confirmations_missing,
+        "lost_since_s": mapper.lost_since_s,
+        "repeats": mapper.repeats,
+        "repeats_since_s": mapper.repeats_since_s,
+        "last_ranges": np.asarray(mapper.last_ranges, np.float32),
+        "odometry.stamps_s": np.array(mapper.odometry.stamps_s),
+        "odometry.poses": np.array(mapper.odometry.poses).reshape(-1, 3),
+        "odometry.pieces": np.array(mapper.odometry.pieces, np.int64),
+        "pose": local.pose,
+        "last_scan_s": local.last_scan_s,
+        "keyframe_pose": local.keyframe_pose,
+        "keyframe_s": local.keyframe_s,
+        "keyframe_variance": local.keyframe_variance,
+        "scans": np.array(local.scans).reshape(-1, 5),
+        **search_state(mapper),
+        **filter_state(mapper),
+        **drawing_state(local.drawing),
+    }
+
+
+def search_state(mapper: Mapper) -> State:
+    """A search under way is begun again from its scan."""
+    search = mapper.search
+    if search is None:
+        return {"search.stamp_s": math.nan}
+    return {"search.stamp_s": search.stamp_s, "search.points_m": search.points_m, "search.next_heading": search.next_heading}
+
+
+def filter_state(mapper: Mapper) -> State:
+    particles = mapper.map.filter
+    fields = particles.fields
+    used, tables = np.unique(fields.tables, return_inverse=True)  # tiles are numbered anew; 0 stays 0
+    if used[0] != 0:
+        used, tables = np.append(0, used), tables + 1
+    return {
+        "poses": particles.poses,
+        "log_weights": particles.log_weights,
+        "next_parents": particles.next_parents,
+        "followed": particles.followed,
+        "forgotten": particles.forgotten,
+        "lineage": np.array(particles.lineage, np.int64),
+        "line": particles.line,
+        "path_sizes": np.array([len(p) for p in particles.path], np.int64),
+        "path": np.vstack([np.empty((0, 3)), *particles.path]),
+        "parents": np.concatenate([np.empty(0, np.uint8), *particles.parents]),
+        "tables": tables.reshape(fields.tables.shape).astype(np.int32),
+        "tiles": fields.pool[used],
+        "fields.first_tile": fields.first_tile,
+    }
+
+
+def drawing_state(drawing: Drawing) -> State:
+    scans = drawing.scans
+    return {
+        **grid_state("grid", drawing.grid),
+        **grid_state("base", drawing.base),
+        "coarse.cells": drawing.coarse.cells,
+        "coarse.first": drawing.coarse.first,
+        "drawn.poses": drawing.poses,
+        "drawn.oldest": drawing.oldest,
+        "drawn.redrawn": drawing.redrawn,
+        "drawn.sizes": np.array([len(s.points_m) for s in scans], np.int64),
+        "drawn.points_m": np.vstack([np.empty((0, 2), np.float32), *(s.points_m for s in scans)]).astype(np.float32),
+        "drawn.is_hit": np.concatenate([np.empty(0, bool), *(s.is_hit for s in scans)]).astype(bool),
+        "drawn.is_partial": np.array([s.is_partial for s in scans], bool),
+        "fresh.poses": -1 if drawing.fresh is None else len(drawing.fresh.poses),
+        "fresh.target": drawing.target,
+    }
+
+
+def grid_state(name: str, grid: LogOddsGrid) -> State:
+    return {
+        f"{name}.cells": grid.cells,
+        f"{name}.first_tile": grid.first_tile,
+        f"{name}.revision": grid.revision,
+        f"{name}.tile_revisions": grid.tile_revisions,
+    }
+
+
+def put_state(mapper: Mapper, state: State) -> None:
+    """The inverse of `state_of`."""
+    if state["resolution_m"] != mapper.options.resolution_m:
+        raise CheckpointError(
+            f"the saved map has cells of {state['resolution_m']} m, the options say {mapper.options.resolution_m} m"
+        )
+    mapper.rng.bit_generator.state = state["rng"]
+    mapper.epoch, mapper.status = state["epoch"], MapperStatus(state["status"])
+    mapper.contradictions, mapper.confirmations_missing = state["contradictions"], state["confirmations_missing"]
+    mapper.lost_since_s, mapper.last_ranges = state["lost_since_s"], state["last_ranges"]
+    mapper.repeats, mapper.repeats_since_s = state["repeats"], state["repeats_since_s"]
+    mapper.odometry.stamps_s = state["odometry.stamps_s"].tolist()
+    mapper.odometry.poses = [(x, y, theta) for x, y, theta in state["odometry.poses"].tolist()]
+    mapper.odometry.pieces = state["odometry.pieces"].tolist()
+    local = mapper.map
+    local.pose, local.last_scan_s = state["pose"], state["last_scan_s"]
+    local.keyframe_pose, local.keyframe_s, local.keyframe_variance = (
+        state["keyframe_pose"],
+        state["keyframe_s"],
+        state["keyframe_variance"],
+    )
+    local.scans = [(s, int(k), x, y, theta) for s, k, x, y, theta in state["scans"].tolist()]
+    put_filter(mapper, state)
+    put_drawing(local.drawing, state)
+    put_search(mapper, state)
+
+
+def put_search(mapper: Mapper, state: State) -> None:
+    if math.isnan(state["search.stamp_s"]):
+        return
+    mapper.search = mapper.map.search_for(state["search.points_m"], state["search.stamp_s"])
+    while mapper.search.next_heading < state["search.next_heading"]:
+        mapper.search.step()
+
+
+def put_filter(mapper: Mapper, state: State) -> None:
+    particles, tables, tiles = mapper.map.filter, state["tables"], state["tiles"]
+    if len(state["poses"]) != len(tables) or tiles.shape[1:] != (AREA,) or (tables.size and tables.max() >= len(tiles)):
+        raise CheckpointError("the saved map is damaged: particles and tiles do not fit together")
+    particles.poses, particles.log_weights = state["poses"], state["log_weights"]
+    particles.next_parents, particles.followed, particles.forgotten = state["next_parents"], state["followed"], state["forgotten"]
+    particles.lineage, particles.line = state["lineage"].tolist(), state["line"]
+    ends = np.cumsum(state["path_sizes"])[:-1]
+    if len(state["path_sizes"]):
+        particles.path, particles.parents = np.split(state["path"], ends), np.split(state["parents"], ends)
+    particles.fields.put(tables.astype(np.int64), tiles, state["fields.first_tile"])
+
+
+def put_drawing(drawing: Drawing, state: State) -> None:
+    put_grid(drawing.grid, "grid", state)
+    put_grid(drawing.base, "base", state)
+    drawing.coarse.cells, drawing.coarse.first = state["coarse.cells"], state["coarse.first"]
+    drawing.poses, drawing.oldest, drawing.redrawn = state["drawn.poses"], state["drawn.oldest"], state["drawn.redrawn"]
+    if len(state["drawn.sizes"]):
+        ends = np.cumsum(state["drawn.sizes"])[:-1]
+        points, hits = np.split(state["drawn.points_m"], ends), np.split(state["drawn.is_hit"], ends)
+        drawing.scans = [DrawnScan(p, h, bool(b)) for p, h, b in zip(points, hits, state["drawn.is_partial"], strict=True)]
+    if state["fresh.poses"] >= 0:
+        drawing.resume(state["fresh.target"], state["fresh.poses"])
+
+
+def put_grid(grid: LogOddsGrid, name: str, state: State) -> None:
+    grid.cells, grid.first_tile = state[f"{name}.cells"], state[f"{name}.first_tile"]
+    grid.revision, grid.tile_revisions = state[f"{name}.revision"], state[f"{name}.tile_revisions"]

@@ -1,0 +1,135 @@
+"""One map in one frame: the particles, the grid of the followed one, and where the robot is in it.
+
+track     every scan       where is the robot?                        tracking.py
+update    a keyframe       all particles; the grid of the followed    particle_filter.py, redrawing.py
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.mapping.motion import Motion
+from agent.mapping.options import MappingOptions
+from agent.mapping.particle_filter import ParticleFilter
+from agent.mapping.redrawing import Drawing
+from agent.mapping.relocalization import Relocalization
+from agent.mapping.scan_points import ScanPoints
+from agent.mapping.tracking import Tracked, track
+from protocol.geometry import SE2, wrap_angle
+
+KEPT_SCANS = 100_000  # of the trajectory: three hours at 10 Hz
+UNKNOWN_MOTION = (0.5, 0.4)  # one sigma, metres and radians, when odometry says nothing
+
+
+class LocalMap:
+    """What one robot knows since it last began anew."""
+
+    def __init__(self, options: MappingOptions, rng: np.random.Generator) -> None:
+        self.options = options
+        self.filter = ParticleFilter(options.particles, options.resolution_m, rng)
+        self.drawing = Drawing(options)
+        self.pose = np.zeros(3)  # T_map_robot at last_scan_s
+        self.last_scan_s = math.nan
+        self.keyframe_pose = np.zeros(3)  # the followed particle's pose when it last drew
+        self.keyframe_s = math.nan
+        self.keyframe_variance = np.zeros(2)  # of the motion since then
+        self.scans: list[tuple[float, int, float, float, float]] = []  # stamp, keyframe, pose relative to that keyframe
+
+    @property
+    def is_empty(self) -> bool:
+        return math.isnan(self.last_scan_s)
+
+    def start(self, points: ScanPoints) -> None:
+        """The first scan makes the frame: the robot stands at its origin."""
+        self.filter.start(points.surface_m)
+        self.drawing.add(points, self.pose)
+        self.keyframe_s = points.stamp_s
+        self.accept(points.stamp_s, self.pose)
+
+    def track(self, motion: Motion, points: ScanPoints) -> Tracked:
+        """Where the robot is now, if it moved like this; believed or not by the caller."""
+        step = math.hypot(motion.T_from_to.x_m, motion.T_from_to.y_m), abs(motion.T_from_to.theta_rad)
+        deviation = self.options.motion_noise.deviations(motion.T_from_to)
+        if not motion.is_known:
+            step = deviation = UNKNOWN_MOTION
+        predicted = self.predicted(motion)
+        fields, particle = self.filter.fields, self.filter.followed
+        return track(fields, particle, self.drawing.coarse, predicted, step, deviation, points.matching_m)
+
+    def predicted(self, motion: Motion) -> NDArray[np.float64]:
+        return as_array(as_pose(self.pose) @ motion.T_from_to)
+
+    def accept(self, stamp_s: float, pose: NDArray[np.float64]) -> None:
+        """The robot is here now."""
+        self.pose, self.last_scan_s = pose, stamp_s
+        relative = as_pose(self.keyframe_pose).inverse() @ as_pose(pose)
+        if len(self.scans) >= KEPT_SCANS:
+            del self.scans[: KEPT_SCANS // 2]
+        self.scans.append((stamp_s, len(self.filter.line) - 1, relative.x_m, relative.y_m, relative.theta_rad))
+
+    def note_motion(self, motion: Motion) -> None:
+        """Uncertainty grows with what the wheels say."""
+        deviation = self.options.motion_noise.deviations(motion.T_from_to) if motion.is_known else UNKNOWN_MOTION
+        self.keyframe_variance = self.keyframe_variance + np.square(deviation)
+
+    def steady_motion(self, stamp_s: float) -> Motion:
+        """Without wheels: as fast as between the last two scans."""
+        if len(self.scans) < 2:
+            return Motion(SE2.identity(), is_known=False)
+        (before_s, *_), (last_s, *_) = self.scans[-2:]
+        before, last = (as_pose(self.filter.line[k]) @ SE2(*relative) for _, k, *relative in self.scans[-2:])
+        step = before.inverse() @ last
+        share = (stamp_s - last_s) / max(last_s - before_s, 1e-3)
+        if share > 3.0:
+            return Motion(SE2.identity(), is_known=False)
+        return Motion(SE2(step.x_m * share, step.y_m * share, step.theta_rad * share), is_known=False)
+
+    def is_keyframe(self, stamp_s: float, pose: NDArray[np.float64]) -> bool:
+        """Moved or turned far enough, or long enough ago."""
+        return bool(
+            math.hypot(*(pose - self.keyframe_pose)[:2]) >= self.options.keyframe_distance_m
+            or abs(wrap_angle(pose[2] - self.keyframe_pose[2])) >= self.options.keyframe_angle_rad
+            or stamp_s - self.keyframe_s >= self.options.keyframe_interval_s
+        )
+
+    def update(self, points: ScanPoints, pose: NDArray[np.float64]) -> None:
+        """A keyframe seen from `pose`: every particle matches and draws it, and so does the grid."""
+        motion = as_array(as_pose(self.keyframe_pose).inverse() @ as_pose(pose))
+        deviation_m, deviation_rad = np.sqrt(self.keyframe_variance)
+        self.filter.update(motion, (float(deviation_m), float(deviation_rad)), points.matching_m, points.surface_m)
+        self.drawing.add(points, self.filter.line[-1])
+        self.drawing.follow(self.filter.line)
+        self.keyframe_s = points.stamp_s
+        self.keyframe_pose = self.filter.poses[self.filter.followed].copy()
+        self.keyframe_variance = np.zeros(2)
+
+    def search_for(self, points_m: NDArray[np.float32], stamp_s: float) -> Relocalization:
+        """A search for a scan on the whole map."""
+        return Relocalization(self.drawing.coarse, points_m, stamp_s)
+
+    def move_to(self, pose: NDArray[np.float64], stamp_s: float) -> None:
+        """The robot was found again: everything goes on from here."""
+        self.filter.poses = np.tile(pose, (self.filter.particles, 1))
+        self.pose, self.last_scan_s = pose.copy(), stamp_s
+        self.keyframe_pose, self.keyframe_s = pose.copy(), stamp_s
+        self.keyframe_variance = np.zeros(2)
+
+    def trajectory(self) -> NDArray[np.float64]:
+        """(N, 4) stamp, x, y, theta at every accepted scan, as the followed particle remembers it now."""
+        scans = np.array(self.scans).reshape(-1, 5)
+        frames = self.filter.line[scans[:, 1].astype(np.int64)]
+        cos, sin = np.cos(frames[:, 2]), np.sin(frames[:, 2])
+        x = frames[:, 0] + cos * scans[:, 2] - sin * scans[:, 3]
+        y = frames[:, 1] + sin * scans[:, 2] + cos * scans[:, 3]
+        return np.stack([scans[:, 0], x, y, frames[:, 2] + scans[:, 4]], axis=1)
+
+
+def as_pose(xyt: NDArray[np.float64]) -> SE2:
+    return SE2(float(xyt[0]), float(xyt[1]), wrap_angle(float(xyt[2])))
+
+
+def as_array(pose: SE2) -> NDArray[np.float64]:
+    return np.array([pose.x_m, pose.y_m, pose.theta_rad])
