@@ -203,6 +203,7 @@ def problems(node: Node, fleet: FleetState) -> list[str]:
         lost, came = node.readings.scans_lost, node.readings.scans_in
         said.append(f"{lost} of {came} scans lost: this computer is too slow, lower mapping.particles")
     said += [f"worker {name} makes no progress" for name in node.health.stuck]
+    said += [f"worker {r.name} fails: {r.last_error}; please report this with the log" for r in node.reports() if r.is_failing]
     if node.state is not None and node.state.last_error:
         said.append(f"the map cannot be saved: {node.state.last_error}")
     return said

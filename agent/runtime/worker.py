@@ -27,6 +27,7 @@ class WorkerReport:
     steps: int
     errors: int
     last_error: str
+    is_failing: bool = False  # the newest step ended with an exception
 
     @property
     def is_stuck(self) -> bool:
@@ -45,6 +46,7 @@ class Worker:
         self.steps = 0
         self.errors = 0
         self.last_error = ""
+        self._is_failing = False
 
     def start(self) -> None:
         self._progress_s = time.monotonic()
@@ -61,12 +63,13 @@ class Worker:
 
     def report(self) -> WorkerReport:
         idle_s = time.monotonic() - self._progress_s
-        return WorkerReport(self.name, idle_s, self.deadline_s, self.steps, self.errors, self.last_error)
+        return WorkerReport(self.name, idle_s, self.deadline_s, self.steps, self.errors, self.last_error, self._is_failing)
 
     def _run(self) -> None:
         while not self._stop.is_set():
             try:
                 self._step()
+                self._is_failing = False
             except Exception as error:
                 self._note(error)
             self.steps += 1
@@ -75,6 +78,7 @@ class Worker:
     def _note(self, error: Exception) -> None:
         """First time with traceback, then the 10th, 100th, ...: a fault that repeats does not fill the disk."""
         self.errors += 1
+        self._is_failing = True
         self.last_error = f"{type(error).__name__}: {error}"
         if str(self.errors).strip("0") == "1":
             log.error("worker=%s failed, goes on; errors=%d", self.name, self.errors, exc_info=error)

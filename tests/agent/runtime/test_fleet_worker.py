@@ -89,7 +89,7 @@ def test_garbage_on_a_peers_keys_harms_nobody(stack: contextlib.ExitStack) -> No
     stranger = stack.enter_context(
         Exchange(NetworkSettings("x", fleet=FLEET, connect=tuple(a.exchange.locators())), lambda _: b"?")
     )
-    until(lambda: stranger.links())
+    until(stranger.links)
     for register in ("hello", "beat", "map/feat", "edge/a", "global/meta"):
         for payload in stranger_says:
             stranger.put(robot_key(FLEET, "x", register), payload)
