@@ -145,6 +145,14 @@ class Ld06(FixedFrameLidar):
         self._last_start_cdeg = start_cdeg = _u16(last, 4)
         return start_cdeg < before or _u16(last, 42) < start_cdeg
 
+    def _follow(self, data: Bytes) -> NDArray[np.bool_]:
+        start_cdeg = data[:, 4].astype(np.int64) | data[:, 5].astype(np.int64) << 8
+        end_cdeg = data[:, 42].astype(np.int64) | data[:, 43].astype(np.int64) << 8
+        step_cdeg = (end_cdeg - start_cdeg) % 36000 / (BEAMS - 1)
+        between_cdeg = (start_cdeg[1:] - end_cdeg[:-1]) % 36000
+        follows: NDArray[np.bool_] = between_cdeg <= 2.5 * np.minimum(step_cdeg[1:], step_cdeg[:-1]) + 10
+        return follows
+
     def _beams(self, frames: Bytes, gaps: NDArray[np.int64], arrivals_s: NDArray[np.float64]) -> Beams:
         head = np.ascontiguousarray(frames[:, 2:6]).view("<u2").astype(np.float64)  # speed, start
         tail = np.ascontiguousarray(frames[:, 42:46]).view("<u2").astype(np.float64)  # end, ms

@@ -18,7 +18,7 @@ from hw.framing import Bytes, ByteWindow, FixedFrames
 from hw.rplidar_capsules import KINDS, CapsuleKind, frames_of, start_angles_q6
 from hw.rplidar_nodes import NodeFinder
 from hw.scan_assembler import Beams
-from hw.spinning import SpinningLidar
+from hw.spinning import Floats, Ints, SpinningLidar, carried
 
 BAUDS = (115200, 460800, 256000, 1000000)
 RANGE_MIN_M, RANGE_MAX_M = 0.05, 40.0
@@ -27,7 +27,8 @@ MODES = {"standard": wire.NODE_TYPE, "express": wire.EXPRESS_TYPE, "dense": wire
 MODES |= {"ultra": wire.ULTRA_TYPE, "ultradense": wire.ULTRA_DENSE_TYPE}
 CIRCLE_Q6 = 360 * 64
 MOST_HZ = 100.0  # a capsule that spans more of the circle than this speed allows is not one
-SPAN_TOLERANCE = 0.3  # between capsules the motor's speed does not change by more
+SPAN_TOLERANCE = 0.05  # real capsules differ by 2 % (SERIAL.md 1.7); a damaged angle by more, or it does not matter
+NEW_SPEED_AFTER = 4  # so many strange spans in a row are a new speed
 
 
 class Rplidar(SpinningLidar):
@@ -60,7 +61,7 @@ class Rplidar(SpinningLidar):
         self._nodes.restart()
         self._last_capsule: Bytes | None = None
         self._last_gap, self._last_arrival_s = 0, 0.0
-        self._usual_span_q6 = 0.0
+        self._usual_span_q6, self._strange_spans = 0.0, 0
         self._last_angle_q6 = 0
 
     def start(self) -> Script:
@@ -209,6 +210,7 @@ class Rplidar(SpinningLidar):
         self.counters.gap_bytes = 0
         if descriptor.is_multi:
             self.scan_type = descriptor.type
+            self._assembler.witnesses = (1, 3) if descriptor.type == wire.ULTRA_TYPE else (1,)
             self._restart_stream()
             self._drop_held()
             self._assembler.restart()
@@ -257,13 +259,13 @@ class Rplidar(SpinningLidar):
             self._last_angle_q6 = angle_q6
         return self._hold(frames, now_s, is_turn)
 
-    def _beams(self, frames: Bytes, gaps: NDArray[np.int64], arrivals_s: NDArray[np.float64]) -> Beams:
+    def _beams(self, frames: Bytes, gaps: Ints, arrivals_s: Floats) -> Beams:
         if self.scan_type == wire.NODE_TYPE:
             return self._node_beams(frames, gaps, arrivals_s)
         assert self.scan_type is not None
         return self._capsule_beams(KINDS[self.scan_type], frames, gaps, arrivals_s)
 
-    def _node_beams(self, nodes: Bytes, gaps: NDArray[np.int64], arrivals_s: NDArray[np.float64]) -> Beams:
+    def _node_beams(self, nodes: Bytes, gaps: Ints, arrivals_s: Floats) -> Beams:
         words = nodes.astype(np.int64)
         turn_deg = (words[:, 1] >> 1 | words[:, 2] << 7) / 64.0
         mm = (words[:, 3] | words[:, 4] << 8) / 4.0
@@ -276,7 +278,11 @@ class Rplidar(SpinningLidar):
             is_dirty=gaps > 0,
         )
 
-    def _capsule_beams(self, kind: CapsuleKind, frames: Bytes, gaps: NDArray[np.int64], arrivals_s: NDArray[np.float64]) -> Beams:
+    def _witnessed(self, data: Bytes, gaps: Ints, arrivals_s: Floats) -> tuple[Bytes, Ints, Floats]:
+        """Nodes were chosen by how they follow; capsules are chosen by the one behind them, when they are decoded."""
+        return data, gaps, arrivals_s
+
+    def _capsule_beams(self, kind: CapsuleKind, frames: Bytes, gaps: Ints, arrivals_s: Floats) -> Beams:
         """Beams of all capsules whose follower is here; the last one waits for its own."""
         if self._last_capsule is not None:
             frames = np.concatenate([self._last_capsule, frames])
@@ -285,7 +291,7 @@ class Rplidar(SpinningLidar):
         self._last_capsule, self._last_gap, self._last_arrival_s = frames[-1:], int(gaps[-1]), float(arrivals_s[-1])
         start_q6, is_first = start_angles_q6(kind, frames)
         span_q6 = np.diff(start_q6) % CIRCLE_Q6
-        is_true = self._are_true(kind, span_q6, start_q6[:-1], gaps[1:] > 0) & ~is_first[1:]
+        is_true = self._are_true(kind, span_q6, start_q6[:-1], (gaps[1:] == 0) & ~is_first[1:])
         this, following = frames[:-1][is_true], frames[1:][is_true]
         beams = kind.decode(this, following)
         n = kind.samples
@@ -294,7 +300,7 @@ class Rplidar(SpinningLidar):
         sample_s = span_deg / 360.0 * self.period_s / n
         sent_s = kind.length * 10.0 / self.baud
         stamps_s = (arrivals_s[:-1][is_true] - sent_s)[:, None] - sample_s[:, None] * np.arange(n - 1, -1, -1)
-        dirty = ((gaps[:-1] > 0) | (gaps[1:] > 0))[is_true]
+        dirty = carried((gaps[:-1] > 0) | ~is_true, is_true)
         mm = beams.distance_mm
         return Beams(
             turn_deg=turn_deg.ravel(),
@@ -305,17 +311,18 @@ class Rplidar(SpinningLidar):
             is_dirty=np.repeat(dirty, n),
         )
 
-    def _are_true(
-        self, kind: CapsuleKind, span_q6: NDArray[np.int64], start_q6: NDArray[np.int64], is_gap: NDArray[np.bool_]
-    ) -> NDArray[np.bool_]:
-        """Which capsules are followed by their own follower: the span between them is what the motor's speed makes it."""
+    def _are_true(self, kind: CapsuleKind, span_q6: Ints, start_q6: Ints, is_next: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Which capsules are followed by their own follower: no byte between, and the span the motor's speed makes."""
         most_q6 = MOST_HZ * 360 * 64 * kind.samples * 500e-6  # no RPLIDAR takes longer than 500 us for a sample
-        can_be = (span_q6 > 0) & (span_q6 < min(most_q6, 180 * 64)) & (start_q6 < CIRCLE_Q6)
-        usual_q6 = self._usual_span_q6 or float(np.median(span_q6[can_be])) if can_be.any() else 0.0
-        is_true: NDArray[np.bool_] = can_be & (np.abs(span_q6 - usual_q6) <= SPAN_TOLERANCE * usual_q6 + 64)
-        if is_true.any():
-            self._usual_span_q6 = float(np.median(span_q6[is_true]))
-        elif can_be.any():
-            self._usual_span_q6 = float(np.median(span_q6[can_be]))  # the motor was set to another speed
-        self.counters.rejected += int(np.count_nonzero(~is_true & ~is_gap))
+        can_be = is_next & (span_q6 > 0) & (span_q6 < min(most_q6, 180 * 64)) & (start_q6 < CIRCLE_Q6)
+        is_true = np.zeros_like(can_be)
+        for k in np.flatnonzero(can_be).tolist():
+            change = abs(span_q6[k] - self._usual_span_q6)
+            is_true[k] = change <= SPAN_TOLERANCE * self._usual_span_q6 + 4
+            self._strange_spans = 0 if is_true[k] else self._strange_spans + 1
+            if is_true[k]:
+                self._usual_span_q6 += 0.2 * (span_q6[k] - self._usual_span_q6)
+            elif self._strange_spans >= NEW_SPEED_AFTER or not self._usual_span_q6:  # the motor was set to another speed
+                self._usual_span_q6, self._strange_spans = float(span_q6[k]), 0
+        self.counters.rejected += int(np.count_nonzero(can_be & ~is_true))
         return is_true

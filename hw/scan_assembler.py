@@ -7,8 +7,8 @@ cut to cut are handed on.  What was not seen makes the revolution partial:
           never   |<---- one scan, coverage 0.9: partial ----->|
 
 On a line that is not clean an 8-bit checksum lets one damaged packet in 256 through (an XOR lets two equal flips through).
-So in a revolution with damage around it a beam stands only when it lies between its two neighbours' ranges, give or take
-the noise; all others are invalid.  On a clean line nothing is filtered.
+So in a revolution with damage around it a beam stands only when it lies midway between its two neighbours, as it does on
+a wall, give or take the noise; all others are invalid.  On a clean line nothing is filtered.
 """
 
 from __future__ import annotations
@@ -61,6 +61,7 @@ class ScanAssembler:
         self.range_min_m, self.range_max_m = range_min_m, range_max_m
         self.period_s = 0.1  # of the last whole revolution
         self.coverage = 0.0  # of the last scan
+        self.witnesses: tuple[int, ...] = (1,)  # see `supported_only`
         self.discarded = 0  # revolutions with too little in them
         self._pending: list[Beams] = []
         self._pending_n = 0
@@ -134,7 +135,7 @@ class ScanAssembler:
                 (ranges_m < self.range_min_m) | ((ranges_m > self.range_max_m) & np.isfinite(ranges_m)), np.nan, ranges_m
             )
         if must_filter:
-            ranges_m = supported_only(ranges_m)
+            ranges_m = supported_only(ranges_m, self.witnesses)
         offsets_s = np.maximum.accumulate(beams.stamps_s - beams.stamps_s[0])
         return LaserScan(
             stamp_s=float(beams.stamps_s[0]),
@@ -172,15 +173,19 @@ def coverage_of(turn_deg: Floats) -> float:
     return float(1.0 - missing[gaps > 2.0 * max(usual, 0.05)].sum() / 360.0)
 
 
-NOISE_M, NOISE_SHARE = 0.03, 0.01  # how far a true beam may lie outside its neighbours: range noise of cheap LIDARs
+NOISE_M, NOISE_SHARE = 0.012, 0.003  # how far a beam may lie from the mean of its neighbours; a flipped bit moves it further
 NEIGHBOURS_M, NEIGHBOURS_SHARE = 0.10, 0.05  # neighbours further apart than this are an edge: no witness
 
 
-def supported_only(ranges_m: Floats) -> Floats:
-    """The ranges that lie between both their neighbours, which agree; the others become nan."""
-    before, after = np.roll(ranges_m, 1), np.roll(ranges_m, -1)
+def supported_only(ranges_m: Floats, steps: tuple[int, ...] = (1,)) -> Floats:
+    """The ranges that lie midway between both their neighbours, as beams on a wall do; the others become nan.
+
+    `steps`: which neighbours are asked; a protocol that codes three beams by one number has all three wrong at once.
+    """
+    stands = np.ones(len(ranges_m), bool)
     with np.errstate(invalid="ignore"):
-        agree = np.abs(before - after) <= NEIGHBOURS_M + NEIGHBOURS_SHARE * ranges_m
-        margin_m = np.abs(before - after) / 2 + NOISE_M + NOISE_SHARE * ranges_m
-        between = np.abs(ranges_m - (before + after) / 2) <= margin_m
-        return np.where(agree & between, ranges_m, np.nan)
+        for step in steps:
+            before, after = np.roll(ranges_m, step), np.roll(ranges_m, -step)
+            stands &= np.abs(before - after) <= step * (NEIGHBOURS_M + NEIGHBOURS_SHARE * ranges_m)
+            stands &= np.abs(ranges_m - (before + after) / 2) <= NOISE_M + NOISE_SHARE * ranges_m
+    return np.where(stands, ranges_m, np.nan)

@@ -38,7 +38,7 @@ FIELDS = {
 MIRROR_S = 1 / 75  # a turn of the mirror; half- and quarter-degree scans take two and four
 RANGE_MIN_M, RANGE_MAX_M = 0.05, 80.0
 CM_CODES, MM_CODES = 0x1FF7, 0x7FF7  # from here on a value is no distance: dazzled, out of range, ...
-DIRTY_S = 2.0  # how long after damage on the line scans are looked at twice
+SUSPECT_SCANS = 8  # after damage on the line so many scans are looked at twice: a 16-bit sum misses one bad telegram in 65536
 
 
 def crc16(data: bytes | bytearray) -> int:
@@ -126,7 +126,7 @@ class SickLms(DriverBase):
         )
         self._answers: dict[int, bytes] = {}
         self._last_scan_s: float | None = None
-        self._dirty_until_s = -1.0
+        self._suspect_scans = 0
 
     def limit(self, range_min_m: float, range_max_m: float) -> None:
         """Believe only ranges within these limits."""
@@ -166,13 +166,11 @@ class SickLms(DriverBase):
 
     def feed(self, data: bytes, now_s: float) -> list[Reading]:
         """Scans that these bytes complete; answers are kept for the script."""
-        trouble = self.counters.bad_frames
         self._window.push(data)
         frames = self._finder.take(self._window, self.counters)
-        if self.counters.bad_frames != trouble:
-            self._dirty_until_s = now_s + DIRTY_S
         readings: list[Reading] = []
-        for row, behind in zip(frames.data, frames.behind.tolist(), strict=True):
+        for row, behind, gap in zip(frames.data, frames.behind.tolist(), frames.gap.tolist(), strict=True):
+            self._suspect_scans = SUSPECT_SCANS if gap else max(0, self._suspect_scans - 1)
             n = int(row[2]) | int(row[3]) << 8
             payload = row[4 : 4 + n].tobytes()
             scan = ScanPayload.decode(payload)
@@ -189,7 +187,7 @@ class SickLms(DriverBase):
         metres = ranges_m(scan)
         with np.errstate(invalid="ignore"):
             metres = np.where((metres < self.range_min_m) | (metres > self.range_max_m), np.nan, metres)
-        if end_s < self._dirty_until_s:
+        if self._suspect_scans:
             metres = supported_only(metres)
         if self._last_scan_s is not None and 0.005 < end_s - self._last_scan_s < 2.0:
             self.period_s = 0.8 * self.period_s + 0.2 * (end_s - self._last_scan_s)

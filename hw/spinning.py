@@ -7,6 +7,7 @@ earlier anyway.
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,9 @@ from numpy.typing import NDArray
 from hw.driver import DriverBase, Reading
 from hw.framing import Bytes, ByteWindow, FixedFrames, Frames, SizedFrames
 from hw.scan_assembler import Beams, ScanAssembler
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 PACE_S = 1.0  # over how long the true rate of bytes is measured
 PACE_GAP_S = 0.2  # a longer silence is no pace
@@ -48,6 +52,16 @@ class Pace:
         return max(least_s, (last_s - first_s) / (last - first))
 
 
+@dataclass(frozen=True, slots=True)
+class _Waiting:
+    """The last frame, which waits for the next one to bear it out."""
+
+    data: Bytes
+    gaps: Ints
+    arrivals_s: Floats
+    follows: bool  # from the frame before it
+
+
 class SpinningLidar(DriverBase):
     """A `Driver` but for the protocol: `_find`, `_is_turn` and `_beams` are its own."""
 
@@ -56,7 +70,9 @@ class SpinningLidar(DriverBase):
         self._window = ByteWindow(self.counters)
         self._assembler = ScanAssembler(range_min_m, range_max_m)
         self._held: list[Frames] = []
-        self._held_arrivals_s: list[NDArray[np.float64]] = []
+        self._held_arrivals_s: list[Floats] = []
+        self._due = 0
+        self._last: _Waiting | None = None
         self._pace = Pace()
 
     @property
@@ -83,6 +99,7 @@ class SpinningLidar(DriverBase):
         self._window.clear()
         self._assembler.restart()
         self._drop_held()
+        self._last = None
 
     def feed(self, data: bytes, now_s: float) -> list[Reading]:
         """See `Driver.feed`."""
@@ -95,24 +112,48 @@ class SpinningLidar(DriverBase):
     def _drop_held(self) -> None:
         self._held.clear()
         self._held_arrivals_s.clear()
+        self._due = 0
 
     def _hold(self, frames: Frames, now_s: float, is_turn: bool) -> list[Reading]:
-        """Keep these frames; decode what is kept when a revolution ends."""
-        if len(frames):
-            self._held.append(frames)
-            self._held_arrivals_s.append(now_s - frames.behind.astype(np.float64) * self._pace.byte_s(10.0 / self.baud))
-        if not self._held or not (is_turn or sum(map(len, self._held)) >= HOLD_AT_MOST):
+        """Keep these frames; decode what is kept when a revolution ends, and once more when its last frame has its witness."""
+        if len(frames) == 0:
             return []
+        self._held.append(frames)
+        self._held_arrivals_s.append(now_s - frames.behind.astype(np.float64) * self._pace.byte_s(10.0 / self.baud))
+        self._due = 2 if is_turn else self._due
+        if not self._due and sum(map(len, self._held)) < HOLD_AT_MOST:
+            return []
+        self._due = max(0, self._due - 1)
         data = np.concatenate([held.data for held in self._held])
         gaps = np.concatenate([held.gap for held in self._held])
         arrivals_s = np.concatenate(self._held_arrivals_s)
         self._drop_held()
-        beams = self._beams(data, gaps, arrivals_s)
-        scans = self._assembler.add(beams)
+        scans = self._assembler.add(self._beams(*self._witnessed(data, gaps, arrivals_s)))
         self.period_s = self._assembler.period_s
         return list(scans)
 
-    def _beams(self, frames: Bytes, gaps: NDArray[np.int64], arrivals_s: NDArray[np.float64]) -> Beams:
+    def _witnessed(self, data: Bytes, gaps: Ints, arrivals_s: Floats) -> tuple[Bytes, Ints, Floats]:
+        """The frames that fit the frame before or behind them; the last one waits for the next.
+
+        A damaged frame that passes its checksum is put in the wrong place if its angle is what was damaged.  Frames follow
+        one another without a byte between, each where the one before ended, so a frame that does neither is not believed.
+        """
+        if self._last is not None:
+            data, gaps = np.concatenate([self._last.data, data]), np.concatenate([self._last.gaps, gaps])
+            arrivals_s = np.concatenate([self._last.arrivals_s, arrivals_s])
+        follows = np.concatenate([[self._last is not None and self._last.follows], self._follow(data) & (gaps[1:] == 0)])
+        self._last = _Waiting(data[-1:], gaps[-1:], arrivals_s[-1:], bool(follows[-1]))
+        is_seen = follows[:-1] | follows[1:]
+        self.counters.rejected += int(np.count_nonzero(~is_seen))
+        dirty = carried((gaps[:-1] > 0) | ~is_seen, is_seen)
+        return data[:-1][is_seen], dirty.astype(np.int64), arrivals_s[:-1][is_seen]
+
+    def _follow(self, data: Bytes) -> NDArray[np.bool_]:
+        """Which frames begin where the one before ended: (M,) frames to (M - 1,)."""
+        raise NotImplementedError
+
+    def _beams(self, frames: Bytes, gaps: Ints, arrivals_s: Floats) -> Beams:
+        """What frames say, with the bytes skipped before each and the time each arrived."""
         raise NotImplementedError
 
 

@@ -157,6 +157,11 @@ class Xv11(FixedFrameLidar):
         before, self._last_index = self._last_index, int(frames.data[-1, 1])
         return self._last_index <= before
 
+    def _follow(self, data: Bytes) -> NDArray[np.bool_]:
+        index = data[:, 1].astype(np.int64)
+        follows: NDArray[np.bool_] = (index[1:] - index[:-1]) % self.kind.packets == 1
+        return follows
+
     def _beams(self, frames: Bytes, gaps: NDArray[np.int64], arrivals_s: NDArray[np.float64]) -> Beams:
         n = self.kind.beams
         words = np.ascontiguousarray(frames[:, 2:-2]).view("<u2").astype(np.int64)

@@ -233,24 +233,46 @@ class YdLidar(SpinningLidar):
             self.identity.model = f"YDLIDAR {self.model.name}"
 
     def _size(self, data: bytearray) -> int:
-        """Length of the packet at the front; while the sample width is not known, the one whose checksum fits."""
+        """Length of the packet at the front; 0: it is none."""
         if data[1] == CLOCK_HEADER[1]:
             return 8 if xor8(data[:8]) == 0 else 0
         n = data[3]
         if data[1] != HEADER[1] or not 1 <= n <= MOST_SAMPLES or not data[4] & data[6] & 1:
             return 0
-        for width in (self._width,) if self._width else self._widths:
-            size = HEAD_BYTES + n * width
-            if len(data) < size:
-                return size
-            if _words_xor(bytes(data[:size]), width) == data[8] | data[9] << 8:
-                self._misses = 0
-                self._width = width if n > 1 else self._width
-                return size
+        if not self._width:
+            return self._size_unlocked(data, n)
+        size = HEAD_BYTES + n * self._width
+        if len(data) < size:
+            return size
+        if _words_xor(bytes(data[:size]), self._width) == data[8] | data[9] << 8:
+            self._misses = 0
+            return size
         self._misses += 1
         if self._misses >= UNLOCK_AFTER and len(self._widths) > 1:
             self._width, self._misses = 0, 0
         return 0
+
+    def _size_unlocked(self, data: bytearray, n: int) -> int:
+        """While the sample width is not known: the one whose checksum fits and behind which the next packet begins.
+
+        The checksum alone does not tell: an even number of equal distances has the XOR of none.
+        """
+        most = HEAD_BYTES + n * self._widths[-1] + 2
+        if len(data) < most:
+            return most  # wait
+        for width in self._widths:
+            size = HEAD_BYTES + n * width
+            is_followed = data[size : size + 2] in (HEADER, CLOCK_HEADER)
+            if is_followed and _words_xor(bytes(data[:size]), width) == data[8] | data[9] << 8:
+                self._width = width if n > 4 else 0
+                return size
+        return 0
+
+    def _follow(self, data: Bytes) -> NDArray[np.bool_]:
+        angles_deg = np.floor(np.ascontiguousarray(data[:, 4:8]).view("<u2") / 2) / 64
+        between_deg = (angles_deg[1:, 0] - angles_deg[:-1, 1] + 180) % 360 - 180
+        follows: NDArray[np.bool_] = (between_deg > -0.3) & (between_deg < 4 * (self._usual_step_deg or MOST_STEP_DEG) + 0.5)
+        return follows
 
     def _beams(self, frames: Bytes, gaps: NDArray[np.int64], arrivals_s: NDArray[np.float64]) -> Beams:
         head = np.ascontiguousarray(frames[:, 4:8]).view("<u2").astype(np.float64)
