@@ -43,6 +43,7 @@ from protocol.messages import (
     GlobalTiles,
     Hello,
     MapAnnouncement,
+    MapVersion,
     Message,
     Statement,
     Statements,
@@ -312,8 +313,7 @@ class Coordinator:
             return
         if peer.presence is Presence.LOST:
             self._fetching.forget(peer.robot)
-        if peer.map is not None and before is not None and peer.map.frame != before.frame:
-            self._on_new_frame(peer.robot, now_s)
+        self._check_frame(peer, before, now_s)
 
     def _on_announcement(self, peer: Peer, said: MapAnnouncement, now_s: float) -> None:
         old = peer.announcement
@@ -321,8 +321,7 @@ class Coordinator:
             return
         before = peer.map
         peer.announcement = said
-        if before is not None and peer.map is not None and peer.map.frame != before.frame:
-            self._on_new_frame(peer.robot, now_s)
+        self._check_frame(peer, before, now_s)
 
     def _on_statement(self, peer: Peer, said: Statement, now_s: float) -> None:
         known = peer.statements.get(said.other)
@@ -361,7 +360,6 @@ class Coordinator:
         is_newest = peer.held is None or peer.held.frame != said.map.frame or said.map.revision > peer.held.revision
         if is_newest:
             peer.hold(said.map, tiles.grid())
-            self._admit(peer)
         else:
             peer.versions[said.map.digest] = said.map
 
@@ -375,19 +373,25 @@ class Coordinator:
         """Let a member's new cells into the global map, unless they contradict our own: then check the edge first."""
         assert peer.held is not None and peer.grid is not None
         group, own = self._ledger.group, self._ledger.own
-        if group is None or peer.robot not in group.T_root or own.grid is None:
+        if pair_key(self.robot, peer.robot) not in self._ledger.live or group is None or peer.robot not in group.T_root:
             peer.admitted = peer.held
             return
-        T_ours_theirs = group.T_root[self.robot].inverse() @ group.T_root[peer.robot]
-        found = agreement(own.grid, peer.grid, T_ours_theirs)
+        assert own.grid is not None and own.version is not None
         pair = self._pairs.pair(peer.robot)
-        if pair_key(self.robot, peer.robot) not in self._ledger.live:
+        if pair.is_urgent:
+            return
+        T_ours_theirs = group.T_root[self.robot].inverse() @ group.T_root[peer.robot]
+        is_checked = pair.checked_digests == (own.version.digest, peer.held.digest) and pair.failures == 0
+        limit = pair.conflict_share + self.options.max_new_conflict
+        if is_checked or agreement(own.grid, peer.grid, T_ours_theirs).conflict_share <= limit:
             peer.admitted = peer.held
-        elif found.conflict_share <= pair.conflict_share + self.options.max_new_conflict:
-            peer.admitted = peer.held
-            pair.conflict_share = min(pair.conflict_share, found.conflict_share)
         else:
             pair.is_urgent = True
+
+    def _check_frame(self, peer: Peer, before: MapVersion | None, now_s: float) -> None:
+        frame = peer.map.frame if peer.map else None
+        if frame is not None and (before is None or before.frame != frame):
+            self._on_new_frame(peer.robot, now_s)
 
     def _on_new_frame(self, robot: str, now_s: float) -> None:
         self._pairs.drop_void(robot)
@@ -504,6 +508,8 @@ class Coordinator:
         self._scan_from = (self._scan_from + count) % max(len(everyone), 1)
         for peer in turn:
             self._pull_words(peer, now_s)
+            if peer.held != peer.admitted:
+                self._admit(peer)
         self._pairs.next_job(turn, now_s)
         self._pull_maps(turn, now_s)
 

@@ -173,4 +173,5 @@ def newer_statements(peer: Peer, said: Statements) -> list[Statement]:
     before, peer.statements = peer.statements, {statement.other: statement for statement in said.statements}
     peer.statements_seq = said.seq
     after = peer.statements
-    return [s for other in before.keys() | after.keys() if before.get(other) != (s := after.get(other) or before[other])]
+    changed = [other for other in before.keys() | after.keys() if before.get(other) != after.get(other)]
+    return [after[other] if other in after else before[other] for other in sorted(changed)]

@@ -58,6 +58,7 @@ class Pair:
     """Our side of one pair."""
 
     peer: str
+    boot: int = 0  # of the peer, when we spoke about the pair last
     phase: str = "unseen"
     reason: str = ""
     attempts: int = 0
@@ -369,6 +370,7 @@ class PairWork:
         readable = "".join(c for c in reason if c.isprintable())[:80]
         statement = Statement(ledger.robot, ledger.boot, ledger.seq, other, stance, evidence, holds, readable)
         ledger.mine[other] = statement
+        self.pair(other).boot = ledger.peers[other].boot
         ledger.send(statement)
 
     def withdraw(self, other: str, reason: str, now_s: float) -> None:
@@ -401,8 +403,10 @@ class PairWork:
             mine = self._ledger.mine.get(other)
             if mine is None or self._ledger.frame_of(other) is None or self._ledger.is_current(mine.evidence):
                 continue
+            boot = self.pair(other).boot
             pair = self.pairs[other] = Pair(other, attempts=self.pair(other).attempts)
-            if mine.stance in (Stance.PROPOSE, Stance.ACK):
+            is_same_life = other not in self._ledger.peers or self._ledger.peers[other].boot == boot
+            if mine.stance in (Stance.PROPOSE, Stance.ACK) and is_same_life:
                 pair.hint = self._from_our_side(mine.evidence)
             del self._ledger.mine[other]
             self._ledger.seq += 1

@@ -6,6 +6,7 @@ in a map frame of its own; the matcher knows the true transforms but judges ever
 
 from __future__ import annotations
 
+import functools
 import heapq
 import itertools
 import math
@@ -31,15 +32,15 @@ from protocol.geometry import SE2
 from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from protocol.messages import Chunk, GlobalMap, Manifest, Message
 
-CELL_M = 0.5
 TICK_S = 0.2
 MIN_OVERLAP_M2 = 40.0
 
 
-def random_world(seed: int, side_m: float = 60.0) -> OccupancyGrid:
+@functools.lru_cache(maxsize=64)
+def random_world(seed: int, side_m: float = 60.0, cell_m: float = 0.5) -> OccupancyGrid:
     """Free space with walls: nothing repeats."""
     rng = np.random.default_rng(seed)
-    n = int(side_m / CELL_M)
+    n = int(side_m / cell_m)
     cells = np.full((n, n), FREE, np.int8)
     for _ in range(n):
         r, c, length = rng.integers(0, n), rng.integers(0, n), int(rng.integers(4, n // 4))
@@ -47,7 +48,7 @@ def random_world(seed: int, side_m: float = 60.0) -> OccupancyGrid:
             cells[r, c : c + length] = OCCUPIED
         else:
             cells[r : r + length, c] = OCCUPIED
-    return OccupancyGrid(cells, CELL_M, SE2(-side_m / 2, -side_m / 2, 0.0))
+    return OccupancyGrid(cells, cell_m, SE2(-side_m / 2, -side_m / 2, 0.0))
 
 
 @dataclass
@@ -59,6 +60,7 @@ class Explorer:
     seen: NDArray[np.bool_]
     T_world_robot: SE2
     epoch: int = 1
+    _grid: OccupancyGrid | None = None
 
     @staticmethod
     def at(world: OccupancyGrid, T_world_robot: SE2, turn_rad: float) -> Explorer:
@@ -69,23 +71,29 @@ class Explorer:
         """Uncover the world around a place."""
         self.T_world_robot = T_world_robot
         row, col = self.world.cells_at([[T_world_robot.x_m, T_world_robot.y_m]])[0]
-        reach = int(radius_m / CELL_M)
+        reach = int(radius_m / self.world.resolution_m)
         rows, cols = slice(max(row - reach, 0), max(row + reach, 0)), slice(max(col - reach, 0), max(col + reach, 0))
-        self.seen[rows, cols] = True
+        if not self.seen[rows, cols].all():
+            self.seen[rows, cols] = True
+            self._grid = None
 
     @property
     def grid(self) -> OccupancyGrid:
         """(H, W) the seen part, drawn in the map frame; walls and edges may be a cell off, as in real maps."""
-        seen = OccupancyGrid(np.where(self.seen, self.world.cells, UNKNOWN).astype(np.int8), CELL_M, self.world.origin).cropped()
-        T_map_world = self.T_world_map.inverse()
-        corners = T_map_world.apply(
-            seen.origin.apply(
-                [[0, 0], [seen.width * CELL_M, 0], [0, seen.height * CELL_M], [seen.width * CELL_M, seen.height * CELL_M]]
-            )
-        )
-        low = np.floor(corners.min(axis=0) / CELL_M).astype(int)
-        size = np.ceil(corners.max(axis=0) / CELL_M).astype(int) - low + 1
-        frame = OccupancyGrid(np.full((size[1], size[0]), UNKNOWN, np.int8), CELL_M, SE2(low[0] * CELL_M, low[1] * CELL_M, 0.0))
+        if self._grid is None:
+            self._grid = self._drawn()
+        return self._grid
+
+    def _drawn(self) -> OccupancyGrid:
+        cell_m = self.world.resolution_m
+        known = np.where(self.seen, self.world.cells, UNKNOWN).astype(np.int8)
+        seen = OccupancyGrid(known, cell_m, self.world.origin).cropped()
+        width_m, height_m = seen.width * cell_m, seen.height * cell_m
+        corners = seen.origin.apply([[0, 0], [width_m, 0], [0, height_m], [width_m, height_m]])
+        corners = self.T_world_map.inverse().apply(corners)
+        low = np.floor(corners.min(axis=0) / cell_m).astype(int)
+        size = np.ceil(corners.max(axis=0) / cell_m).astype(int) - low + 1
+        frame = OccupancyGrid(np.full((size[1], size[0]), UNKNOWN, np.int8), cell_m, SE2(low[0] * cell_m, low[1] * cell_m, 0.0))
         every = np.indices(frame.cells.shape).reshape(2, -1).T
         frame.cells[:] = seen.values_at(self.T_world_map.apply(frame.points_of(every))).reshape(frame.cells.shape)
         return frame
@@ -106,9 +114,10 @@ class Link:
 
 @dataclass
 class Node:
-    """One robot process."""
+    """One robot process; `robot` is the id it uses, which should be its own."""
 
     name: str
+    robot: str
     explorer: Explorer | None
     options: FleetOptions
     coordinator: Coordinator | None = None
@@ -146,14 +155,14 @@ class Fleet:
 
     # Robots.
 
-    def add(self, name: str, explorer: Explorer | None, options: FleetOptions | None = None) -> Node:
-        node = self.nodes[name] = Node(name, explorer, options or FleetOptions())
+    def add(self, name: str, explorer: Explorer | None, options: FleetOptions | None = None, robot: str | None = None) -> Node:
+        node = self.nodes[name] = Node(name, robot or name, explorer, options or FleetOptions())
         self.start(node)
         return node
 
     def start(self, node: Node) -> None:
         node.life += 1
-        node.coordinator = Coordinator(node.name, self.rng.getrandbits(64), node.options)
+        node.coordinator = Coordinator(node.robot, self.rng.getrandbits(64), node.options)
         node.global_map = None
         if node.explorer is not None:
             self.share_map(node)
@@ -249,9 +258,11 @@ class Fleet:
         self.at(delay_s if not is_lost else 2.0, (lambda: None) if is_lost and self.rng.random() < 0.1 else answer)
 
     def _pull(self, node: Node, fetch: Fetch) -> Message | None:
-        peer = self.nodes.get(fetch.peer)
-        if peer is None or peer.coordinator is None or not self.connects(node.name, fetch.peer):
+        reached = [peer for peer in self.processes(fetch.peer) if self.connects(node.name, peer.name)]
+        if not reached:
             return None
+        peer = self.rng.choice(reached)
+        assert peer.coordinator is not None
         if self.rng.random() < self.link.loss:
             return None
         data = peer.coordinator.register(fetch.key)
@@ -298,6 +309,10 @@ class Fleet:
 
     # The network.
 
+    def processes(self, robot: str) -> list[Node]:
+        """Everything that runs under one robot id: one, unless there are twins."""
+        return [node for node in self.nodes.values() if node.robot == robot and node.is_up]
+
     def connects(self, a: str, b: str) -> bool:
         return self.partition.get(a, 0) == self.partition.get(b, 0) and (a, b) not in self.blocked
 
@@ -340,16 +355,27 @@ class Fleet:
 
 def truthful(fleet: Fleet, node: Node, job: Match) -> MergeResult:
     """The true transform where the cells bear it out; verification of any transform on the cells."""
-    T = job.T_ours_theirs if job.kind is MatchKind.VERIFY else fleet.true_T(node.name, job.peer)
+    T = job.T_ours_theirs if job.kind is MatchKind.VERIFY else fleet.true_T(node.robot, job.peer)
     assert T is not None
     return judged(job.ours, job.theirs, T)
 
 
 def judged(ours: OccupancyGrid, theirs: OccupancyGrid, T: SE2) -> MergeResult:
+    """Cells alone say little, most are free: walls must lie on walls, too."""
     found = agreement(ours, theirs, T)
     factor = MatchFactor(found.agree, found.conflict)
     overlap_m2 = (found.agree + found.conflict) * theirs.resolution_m**2
-    is_good = factor.value >= 0.85 and overlap_m2 >= MIN_OVERLAP_M2
+    is_good = factor.value >= 0.85 and overlap_m2 >= MIN_OVERLAP_M2 and _walls_meet(ours, theirs, T)
     status = MatchStatus.MERGED if is_good else MatchStatus.NO
     covariance = np.diag([1e-3, 1e-3, math.radians(0.2) ** 2])
     return MergeResult(status, T, covariance, factor, overlap_m2, overlap_m2 if is_good else 0.0, reason="simulated")
+
+
+def _walls_meet(ours: OccupancyGrid, theirs: OccupancyGrid, T: SE2) -> bool:
+    """Whether most of their walls that fall on known cells of ours lie within a cell of a wall."""
+    points_m = T.apply(theirs.points_of(np.argwhere(theirs.cells == OCCUPIED)))
+    step = ours.resolution_m
+    around = [(dx, dy) for dx in (-step, 0.0, step) for dy in (-step, 0.0, step)]
+    near = np.any([ours.values_at(points_m + np.array(offset)) == OCCUPIED for offset in around], axis=0)
+    known = ours.values_at(points_m) != UNKNOWN
+    return bool(np.count_nonzero(near & known) >= max(8, 0.8 * np.count_nonzero(known)))
