@@ -82,11 +82,12 @@ def _map_panel(drawn: MapToDraw, colour: Colour, width: int) -> Image:
     canvas.rounds(drawn.features, colour, drawn.matched)
     for number, index in enumerate(drawn.matched["lines"], start=1):
         canvas.wall_line(drawn.features.lines[index], colour, str(number) if number <= NUMBERED_LINES else "")
-    features = drawn.features
-    counts = (
-        f"{len(features.lines)} lines, {len(features.circles)} circles, {len(features.arcs)} arcs, {len(features.curves)} curves"
-    )
-    return _titled(canvas.image, f"{drawn.name}", counts, colour, width)
+    counts = ", ".join(_counted(len(getattr(drawn.features, kind)), kind) for kind in ("lines", "circles", "arcs", "curves"))
+    return _titled(canvas.image, drawn.name, counts, colour, width)
+
+
+def _counted(n: int, plural: str) -> str:
+    return f"{n} {plural if n != 1 else plural[:-1]}"
 
 
 def _overlay_panel(overlay: Overlay, ours: MapToDraw, theirs: MapToDraw) -> Image:
@@ -158,9 +159,11 @@ class _Canvas:
 
     def paint(self, colours: Image) -> None:
         size = (self.image.shape[1], self.image.shape[0])
-        shrinks = self.scale < 1
         flipped = np.ascontiguousarray(colours[::-1])
-        painted = cv2.resize(flipped, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_NEAREST)
+        if self.scale < 1:  # the darkest wins, or walls would fade when a big map shrinks
+            side = math.ceil(1 / self.scale)
+            flipped = np.asarray(cv2.erode(flipped, np.ones((side, side), np.uint8)), np.uint8)
+        painted = cv2.resize(flipped, size, interpolation=cv2.INTER_AREA if self.scale < 1 else cv2.INTER_NEAREST)
         self.image = np.ascontiguousarray(painted, dtype=np.uint8)
 
     def pixels(self, points_m: NDArray[np.floating]) -> NDArray[np.int32]:
