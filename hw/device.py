@@ -19,7 +19,17 @@ from hw.supervisor import Device
 from hw.urls import DeviceUrl, parse_url
 from hw.wheel_driver import BASES
 
-__all__ = ["Device", "DeviceHealth", "DeviceState", "Source", "open_lidar", "open_wheels", "register_scheme", "schemes"]
+__all__ = [
+    "Device",
+    "DeviceHealth",
+    "DeviceState",
+    "Source",
+    "build_driver",
+    "open_lidar",
+    "open_wheels",
+    "register_scheme",
+    "schemes",
+]
 
 
 class Source(Protocol):
@@ -47,12 +57,12 @@ def register_scheme(scheme: str, factory: Factory) -> None:
 
 def open_lidar(url: str) -> Source:
     """A LIDAR by its URL; not yet started."""
-    return _open(url, "lidar", LIDARS)
+    return _open(url, "lidar")
 
 
 def open_wheels(url: str) -> Source:
     """A wheel base by its URL; not yet started."""
-    return _open(url, "wheels", BASES)
+    return _open(url, "wheels")
 
 
 def schemes(kind: str) -> list[str]:
@@ -60,22 +70,26 @@ def schemes(kind: str) -> list[str]:
     return sorted(LIDARS if kind == "lidar" else BASES)
 
 
-def _open(text: str, kind: str, drivers: Mapping[str, Callable[[DeviceUrl], Driver]]) -> Source:
-    url = parse_url(text)
-    if url.scheme in drivers:
-        return _serial_device(url, drivers[url.scheme](url))
-    if url.scheme not in _factories and url.scheme in _on_demand:
-        importlib.import_module(_on_demand[url.scheme])
-    if url.scheme not in _factories:
-        known = ", ".join(sorted([*drivers, *_factories.keys() | _on_demand.keys()]))
+def build_driver(url: DeviceUrl, kind: str) -> Driver:
+    """The driver a URL names, without its port."""
+    drivers: Mapping[str, Callable[[DeviceUrl], Driver]] = LIDARS if kind == "lidar" else BASES
+    if url.scheme not in drivers:
+        known = ", ".join(sorted({*drivers, *_factories, *_on_demand}))
         other = "open it as the other kind of device" if url.scheme in (*LIDARS, *BASES) else f"there are {known}"
-        raise DeviceConfigError(f"{text}: '{url.scheme}' is no kind of {kind}; {other}")
-    return _factories[url.scheme](url, kind)
-
-
-def _serial_device(url: DeviceUrl, driver: Driver) -> Device:
-    if not url.path:
-        raise DeviceConfigError(f"{url.text}: which port? for example {url.scheme}:/dev/ttyUSB0")
+        raise DeviceConfigError(f"{url.text}: '{url.scheme}' is no kind of {kind}; {other}")
+    driver = drivers[url.scheme](url)
     if "baud" in url.options:
         driver.bauds = (url.integer("baud", 0, 300, 4_000_000),)
-    return Device(url.text, driver, lambda baud, dtr: SerialPort(url.path, baud, dtr), url.path)
+    return driver
+
+
+def _open(text: str, kind: str) -> Source:
+    url = parse_url(text)
+    if url.scheme in _on_demand and url.scheme not in _factories:
+        importlib.import_module(_on_demand[url.scheme])
+    if url.scheme in _factories:
+        return _factories[url.scheme](url, kind)
+    driver = build_driver(url, kind)
+    if not url.path:
+        raise DeviceConfigError(f"{text}: which port? for example {url.scheme}:/dev/ttyUSB0")
+    return Device(text, driver, lambda baud, dtr: SerialPort(url.path, baud, dtr), url.path)

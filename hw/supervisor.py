@@ -50,11 +50,12 @@ class Device:
         open_port: OpenPort,
         port_name: str = "",
         rng: random.Random | None = None,
-        tap: Callable[[float, bytes], None] | None = None,
+        is_passive: bool = False,
     ) -> None:
         self._url, self._driver, self._open_port = url, driver, open_port
         self._rng = rng or random.Random()
-        self._tap = tap  # sees every byte that comes, with its time: the recorder
+        self.tap: Callable[[float, bytes], None] | None = None  # sees every byte that is fed, with its time: the recorder
+        self._is_passive = is_passive  # a recording: it speaks, and hears nothing
         self._readings: deque[Reading] = deque()
         self._arrived = threading.Condition()
         self._stopping = threading.Event()
@@ -147,7 +148,12 @@ class Device:
         self._note(state=DeviceState.DISCONNECTED)
 
     def _failed(self, why: str) -> None:
-        self._note(state=DeviceState.DISCONNECTED, last_error=why if why.startswith(self._url) else f"{self._url}: {why}")
+        scheme, _, _ = self._url.partition(":")
+        if self._health.port and why.startswith(self._health.port):
+            why = f"{scheme}:{why}"
+        elif not why.startswith(self._url):
+            why = f"{self._url}: {why}"
+        self._note(state=DeviceState.DISCONNECTED, last_error=why)
 
     def _wait_to_retry(self, seconds: float) -> None:
         """Wait; not longer than until a port that was missing is there again."""
@@ -168,7 +174,7 @@ class Device:
             self._bring_up(self._port)
             self._stream(self._port)
         finally:
-            if not self._is_gone:
+            if not self._is_gone and not self._is_passive:
                 self._quietly(driver.stop())
 
     def _bring_up(self, port: Port) -> None:
@@ -261,6 +267,8 @@ class Device:
 
     def _perform(self, script: Script) -> None:
         """Carry out a driver's script, step by step."""
+        if self._is_passive:
+            return
         answer: Any = None
         while not self._stopping.is_set():
             try:
@@ -320,8 +328,8 @@ class Device:
         if not data:
             return 0
         self._last_bytes_s = now_s = time.monotonic()
-        if self._tap is not None:
-            self._tap(now_s, data)
+        if self.tap is not None:
+            self.tap(now_s, data)
         self._rates.add(now_s, len(data))
         readings = self._driver.feed(data, now_s)
         for reading in readings:

@@ -1,0 +1,57 @@
+"""`mapquilt record DEVICE FILE`: the raw bytes of a device with their times; `replay:FILE` plays them as that device."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+from agent.exits import NEGATIVE, OK, USAGE, CommandError
+from hw.device import open_lidar, open_wheels, schemes
+from hw.errors import DeviceConfigError
+from hw.recorder import Recorder
+from hw.supervisor import Device
+from hw.urls import parse_url
+
+EXAMPLES = """\
+  mapquilt record ld06:/dev/ttyUSB0 lidar.rec               until Ctrl-C
+  mapquilt record wheels:/dev/ttyACM0 wheels.rec --seconds 60
+  mapquilt run --lidar replay:lidar.rec --wheels replay:wheels.rec
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("device", metavar="DEVICE", help="for example ld06:/dev/ttyUSB0")
+    parser.add_argument("file", metavar="FILE", type=Path)
+    parser.add_argument("--seconds", type=float, default=0.0, help="stop after so long (0: Ctrl-C)")
+
+
+def run(args: argparse.Namespace) -> int:
+    try:
+        is_wheels = parse_url(args.device).scheme in schemes("wheels")
+        device = (open_wheels if is_wheels else open_lidar)(args.device)
+        if not isinstance(device, Device):
+            raise DeviceConfigError(f"{args.device} has no bytes of its own; record a device on a serial port")
+        recorder = Recorder(args.file, args.device)
+    except DeviceConfigError as error:
+        raise CommandError(str(error), USAGE) from error
+    with recorder:
+        readings = _record(device, recorder, args.seconds)
+    print(f"{args.file}: {recorder.bytes_written} bytes, {readings} readings", file=sys.stderr)
+    if readings == 0:
+        raise CommandError(device.health().last_error or f"{args.device}: no reading came", NEGATIVE)
+    return OK
+
+
+def _record(device: Device, recorder: Recorder, seconds: float) -> int:
+    """Let the device run for so long, or until Ctrl-C; how many readings it gave."""
+    device.tap = recorder
+    end_s = time.monotonic() + (seconds or float("inf"))
+    try:
+        with device:
+            while time.monotonic() < end_s:
+                device.read(0.2)
+    except KeyboardInterrupt:
+        pass
+    return device.health().readings
