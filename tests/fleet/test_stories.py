@@ -1,0 +1,84 @@
+"""Stories of fleets: real processes, simulated devices behind ptys, real Zenoh on loopback."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+
+import pytest
+
+from agent.commands.demo_figures import agreement, aligned
+from protocol.geometry import SE2
+from tests.harness.fleet import Fleet
+
+MERGE_WITHIN_S = 50.0
+
+
+@pytest.fixture
+def fleet() -> Iterator[Fleet]:
+    with Fleet() as running:
+        yield running
+
+
+def test_two_robots_agree_on_one_map_of_the_place_they_share(fleet: Fleet) -> None:
+    stage = fleet.stage("office", robots=2)
+    for actor in stage.robots:
+        fleet.start(actor)
+    stage.begin()
+    fleet.until(lambda: fleet.agree("robot-1", "robot-2"), MERGE_WITHIN_S, "one map of both")
+    fused, status = fleet.agents["robot-1"].grid(), fleet.status("robot-1")
+    truth, start = stage.truth(), stage.start_pose(status["root"])
+    assert fused is not None and truth is not None and start is not None
+    T_world_global = aligned(fused, truth, start)
+    assert agreement(fused, truth, T_world_global) > 0.98
+    for robot in ("robot-1", "robot-2"):
+        own = fleet.status(robot)
+        was = stage.pose_at(robot, own["mapping"]["pose_stamp_s"])
+        believed = T_world_global @ SE2(*own["frames"][robot]) @ SE2(*own["mapping"]["pose"])
+        assert was is not None
+        assert was.distance_m(believed) < 0.15
+
+
+def test_a_late_joiner_gets_the_whole_map(fleet: Fleet) -> None:
+    stage = fleet.stage("office", robots=3)
+    for actor in stage.robots[:2]:
+        fleet.start(actor)
+    stage.begin()
+    fleet.until(lambda: fleet.agree("robot-1", "robot-2"), MERGE_WITHIN_S, "one map of the first two")
+    fleet.start(stage.robots[2])
+    fleet.until(lambda: fleet.agree("robot-1", "robot-2", "robot-3"), MERGE_WITHIN_S, "one map of all three")
+
+
+def test_a_robot_killed_and_started_again_merges_again(fleet: Fleet) -> None:
+    stage = fleet.stage("office", robots=2)
+    for actor in stage.robots:
+        fleet.start(actor)
+    stage.begin()
+    fleet.until(lambda: fleet.agree("robot-1", "robot-2"), MERGE_WITHIN_S, "one map of both")
+    boot = fleet.status("robot-2")["boot"]
+    fleet.agents["robot-2"].kill()
+    fleet.start(stage.robots[1])
+    assert fleet.status("robot-2")["boot"] != boot
+    fleet.until(lambda: fleet.agree("robot-1", "robot-2"), MERGE_WITHIN_S, "one map again")
+
+
+def test_robots_in_two_buildings_never_merge(fleet: Fleet) -> None:
+    here, there = fleet.stage("office", robots=1, seed=1, prefix="here"), fleet.stage("office", robots=1, seed=2, prefix="there")
+    fleet.start(here.robots[0])
+    fleet.start(there.robots[0])
+    here.begin()
+    there.begin()
+    enough = 60.0  # square metres known to each: plenty of corridor and corners to be fooled by
+    fleet.until(lambda: all(fleet.status(r)["mapping"].get("known_m2", 0) > enough for r in fleet.agents), 40.0, "enough map")
+    fleet.until(lambda: fleet.status("here-1")["attempts"] or fleet.status("there-1")["attempts"], 20.0, "an attempt")
+    fleet.stays(lambda: not fleet.status("here-1")["group"] and not fleet.status("there-1")["group"], 4.0, "two maps")
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_robot_stops_cleanly_within_two_seconds(fleet: Fleet, number: signal.Signals) -> None:
+    stage = fleet.stage("office", robots=1)
+    agent = fleet.start(stage.robots[0])
+    fleet.until(lambda: fleet.status("robot-1")["mapping"]["scans"] > 3, 10.0, "a few scans")
+    agent.signal(number)
+    assert agent.process.wait(2.0) == 0
+    assert "Traceback" not in agent.log_tail(1000)

@@ -1,0 +1,108 @@
+"""Fleets of real robot processes for stories: started on ephemeral ports, looked at, hurt on purpose, gone in the end.
+
+with Fleet(tmp_path) as fleet:
+    stage = fleet.stage("office", robots=2)
+    fleet.start(stage.robots[0]); fleet.start(stage.robots[1])
+    stage.begin()
+    fleet.until(lambda: fleet.agree("robot-1", "robot-2"), 40.0)
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from agent.commands.children import AgentProcess, stop_all
+from agent.commands.demo_stage import Actor, Stage, open_stage
+from agent.runtime.control import ControlError
+
+LOOK_EVERY_S = 0.2
+_numbers = itertools.count()
+
+
+class Fleet:
+    """Robots that know one another by the first one's address (or by `connect`).  One fleet name per test."""
+
+    def __init__(self) -> None:
+        self._stack = contextlib.ExitStack()
+        self.name = f"test-{os.getpid()}-{next(_numbers)}"
+        self.agents: dict[str, AgentProcess] = {}
+        self.folder = Path()
+
+    def __enter__(self) -> Fleet:
+        self.folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="mq-")))  # sockets need short names
+        self._stack.callback(lambda: stop_all(list(self.agents.values())))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def stage(self, world: str, robots: int, seed: int = 0, prefix: str = "robot") -> Stage:
+        """Simulated robots in one world, on ptys."""
+        folder = self.folder / f"{prefix}-devices"
+        folder.mkdir()
+        return self._stack.enter_context(open_stage(world, robots, seed, 60.0, folder, prefix))
+
+    def start(self, actor: Actor, *, connect: Sequence[str] | None = None, arguments: Sequence[str] = ()) -> AgentProcess:
+        """A robot's process on an actor's devices, up and ready; by default it dials the first robot that was started."""
+        dial = (
+            connect
+            if connect is not None
+            else [a.ready["locators"][0] for a in list(self.agents.values())[:1] if a.robot != actor.name]
+        )
+        connections = [part for locator in dial for part in ("--connect", locator)]
+        common = ["--fleet", self.name, "--no-view", *connections, *arguments]
+        agent = AgentProcess(actor.name, [*actor.arguments(), *common], self.folder)
+        previous, self.agents[actor.name] = self.agents.get(actor.name), agent
+        assert previous is None or not previous.is_running
+        agent.wait_ready()
+        return agent
+
+    def status(self, robot: str) -> dict[str, Any]:
+        """What a robot says of itself; empty while it cannot answer."""
+        try:
+            return self.agents[robot].status()
+        except ControlError:
+            return {}
+
+    def global_digest(self, robot: str) -> str | None:
+        return (self.status(robot).get("global") or {}).get("digest")
+
+    def members(self, robot: str) -> list[str]:
+        return list((self.status(robot).get("global") or {}).get("members", []))
+
+    def agree(self, *robots: str) -> bool:
+        """All hold one and the same global map, made of exactly these robots."""
+        states = [self.status(robot).get("global") or {} for robot in robots]
+        return len({s.get("digest") for s in states}) == 1 and all(s.get("members") == sorted(robots) for s in states)
+
+    def until(self, condition: Callable[[], object], within_s: float, what: str = "the condition") -> float:
+        """Wait for a condition; how long it took.  Late: an error with what every robot says."""
+        started = time.monotonic()
+        while not condition():
+            if time.monotonic() - started > within_s:
+                raise AssertionError(f"{what} did not come true within {within_s:.0f} s\n{self.explain()}")
+            time.sleep(LOOK_EVERY_S)
+        return time.monotonic() - started
+
+    def stays(self, condition: Callable[[], object], for_s: float, what: str = "the condition") -> None:
+        """A condition holds all the time."""
+        started = time.monotonic()
+        while time.monotonic() - started < for_s:
+            assert condition(), f"{what} ceased to hold\n{self.explain()}"
+            time.sleep(LOOK_EVERY_S)
+
+    def explain(self) -> str:
+        lines = []
+        for robot, agent in self.agents.items():
+            status = self.status(robot)
+            facts = (f"{key} {status.get(key)}" for key in ("mapping", "peers", "global", "problems"))
+            lines.append(f"{robot}: {', '.join(facts)}")
+            lines.append(agent.log_tail(8))
+        return "\n".join(lines)
