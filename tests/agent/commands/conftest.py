@@ -7,10 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from agent.cli import main
+from agent.map_files import save_map
 from agent.runtime.control import ControlError, ControlServer
+from agent.runtime.keeper import packed_map
+from protocol.geometry import SE2
+from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 STATUS: dict[str, Any] = {
     "robot": "r1", "fleet": "mapquilt", "boot": "00", "uptime_s": 3725.0, "is_paused": False,
@@ -77,7 +82,7 @@ def robot(tmp_path: Path) -> Iterator[Callable[..., FakeRobot]]:
     """`robot("r1")` starts one."""
     started: list[ControlServer] = []
 
-    def start(name: str, folder: Path | None = None, **status: Any) -> FakeRobot:
+    def start(name: str, folder: Path | None = None, maps: dict[str, OccupancyGrid] | None = None, **status: Any) -> FakeRobot:
         heard: list[dict[str, Any]] = []
 
         def told(request: Any) -> dict[str, Any]:
@@ -86,8 +91,12 @@ def robot(tmp_path: Path) -> Iterator[Callable[..., FakeRobot]]:
                 raise ControlError("no peer 'nobody'; known are r2")
             return {"message": f"did {request['command']}"}
 
+        def map_of(request: Any) -> dict[str, Any]:
+            return {"map": packed_map("0.1", (maps or {})[request["name"]])}
+
         commands = dict.fromkeys(("pause", "resume", "reset", "unmerge", "readmit", "save", "stop"), told)
-        handlers = {**commands, "status": lambda _: {"status": {**STATUS, "robot": name, **status}}}
+        known = {**STATUS, "robot": name, "maps": {key: {} for key in maps or {}}, **status}
+        handlers = {**commands, "map": map_of, "status": lambda _: {"status": known}}
         server = ControlServer((folder or tmp_path / "run" / "mapquilt") / f"{name}.sock", handlers)
         server.start()
         started.append(server)
@@ -96,3 +105,25 @@ def robot(tmp_path: Path) -> Iterator[Callable[..., FakeRobot]]:
     yield start
     for server in started:
         server.close()
+
+
+def floor_plan() -> OccupancyGrid:
+    """Three unlike rooms, a corridor, a pillar and a niche: 20 x 12 m, nothing in it repeats."""
+    cells = np.full((240, 400), FREE, np.int8)
+    for y0, x0, y1, x1 in (
+        (0, 0, 2, 400), (238, 0, 240, 400), (0, 0, 240, 2), (0, 398, 240, 400),  # outer walls
+        (90, 0, 92, 130), (90, 160, 92, 400), (2, 190, 90, 192), (120, 0, 122, 60), (120, 90, 122, 300),
+        (120, 340, 122, 400), (122, 140, 200, 142), (122, 280, 238, 282), (40, 330, 60, 360), (200, 60, 202, 120),
+    ):  # fmt: skip
+        cells[y0:y1, x0:x1] = OCCUPIED
+    rows, cols = np.mgrid[:240, :400]
+    distance = np.hypot(rows - 170, cols - 330)
+    cells[(distance > 18) & (distance < 20)] = OCCUPIED
+    cells[distance <= 18] = UNKNOWN
+    return OccupancyGrid(cells, 0.05, SE2(-3.0, -2.0, 0.0))
+
+
+@pytest.fixture
+def office(tmp_path: Path) -> Path:
+    """A map file of it."""
+    return save_map(floor_plan(), tmp_path / "office")[0]

@@ -1,0 +1,38 @@
+"""Files that commands read and write, with what goes wrong turned into one sentence and an exit code."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from agent.exits import BAD_INPUT, ENVIRONMENT, CommandError
+from agent.files import write_atomically
+from agent.map_files import MapFileError, load_map, save_map
+from protocol.grid import OccupancyGrid
+
+
+def loaded_map(path: Path) -> OccupancyGrid:
+    try:
+        return load_map(path)
+    except MapFileError as error:
+        raise CommandError(str(error), BAD_INPUT) from error
+
+
+def saved_map(grid: OccupancyGrid, stem: Path) -> list[Path]:
+    """Writes stem.pgm and stem.yaml; returns both."""
+    try:
+        return list(save_map(grid, stem))
+    except OSError as error:
+        raise _cannot_write(stem, error) from error
+
+
+def written_file(path: Path, data: bytes) -> Path:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, data)
+    except OSError as error:
+        raise _cannot_write(path, error) from error
+    return path
+
+
+def _cannot_write(path: Path, error: OSError) -> CommandError:
+    return CommandError(f"{path}: cannot be written ({error.strerror or error}); give another place with -o", ENVIRONMENT)
