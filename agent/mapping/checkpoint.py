@@ -147,7 +147,7 @@ def drawing_state(drawing: Drawing) -> State:
     return {
         **grid_state("grid", drawing.grid),
         **grid_state("base", drawing.base),
-        "coarse.cells": drawing.coarse.cells,
+        "coarse.empty": drawing.coarse.empty,
         "coarse.first": drawing.coarse.first,
         "drawn.poses": drawing.poses,
         "drawn.oldest": drawing.oldest,
@@ -221,7 +221,7 @@ def put_filter(mapper: Mapper, state: State) -> None:
 def put_drawing(drawing: Drawing, state: State) -> None:
     put_grid(drawing.grid, "grid", state)
     put_grid(drawing.base, "base", state)
-    drawing.coarse.cells, drawing.coarse.first = state["coarse.cells"], state["coarse.first"]
+    drawing.coarse.empty, drawing.coarse.first = state["coarse.empty"], state["coarse.first"]
     drawing.poses, drawing.oldest, drawing.redrawn = state["drawn.poses"], state["drawn.oldest"], state["drawn.redrawn"]
     if len(state["drawn.sizes"]):
         ends = np.cumsum(state["drawn.sizes"])[:-1]

@@ -17,6 +17,9 @@ SHIFT = 5
 AREA = TILE * TILE
 RADIUS = 3  # cells: a kernel is 7 x 7
 PHASES = 4  # a stamp is centred on a quarter of a cell: whole cells blur the field by half of one
+EXPLAINED = (
+    215  # an end point on a cell at least this bright (3.5 cm from a drawn one) is not drawn: it would only widen the wall
+)
 MARGIN_TILES = 8  # tables grow by this much more than asked, so that they seldom grow
 
 Ints = NDArray[np.int64]
@@ -86,19 +89,23 @@ class TiledFields:
         return floor.astype(np.int64), cells - floor
 
     def stamp(self, x_m: Floats, y_m: Floats) -> None:
-        """Draw (P, M) end points, row p into the field of particle p."""
+        """Draw (P, M) end points, row p into the field of particle p; those the field already explains change nothing."""
         row, row_phase = self._phase(y_m, 0)
         col, col_phase = self._phase(x_m, 1)
         height, width = self.tables.shape[1:]
-        base = (np.arange(self.particles) * (height * width))[:, None]
+        base = np.broadcast_to((np.arange(self.particles) * (height * width))[:, None], row.shape)
+        here = self.tables.ravel().take(base + (row >> SHIFT) * width + (col >> SHIFT)) << (2 * SHIFT)
+        here += ((row & (TILE - 1)) << SHIFT) + (col & (TILE - 1))
+        is_new = self.pool.ravel().take(here) < EXPLAINED
+        row, col, base = row[is_new], col[is_new], base[is_new]
         self._own_tiles(base, row, col)
         offsets = np.arange(-RADIUS, RADIUS + 1)
-        rows = row[:, :, None] + offsets  # (P, M, 7)
-        cols = col[:, :, None] + offsets
-        places = (base[:, :, None] + (rows >> SHIFT) * width)[:, :, :, None] + (cols >> SHIFT)[:, :, None, :]
+        rows = row[:, None] + offsets  # (K, 7)
+        cols = col[:, None] + offsets
+        places = (base[:, None] + (rows >> SHIFT) * width)[:, :, None] + (cols >> SHIFT)[:, None, :]
         cells = self.tables.ravel().take(places) << (2 * SHIFT)
-        cells += ((rows & (TILE - 1)) << SHIFT)[:, :, :, None] + (cols & (TILE - 1))[:, :, None, :]
-        values = self.kernels.take(row_phase * PHASES + col_phase, axis=0)
+        cells += ((rows & (TILE - 1)) << SHIFT)[:, :, None] + (cols & (TILE - 1))[:, None, :]
+        values = self.kernels.take((row_phase * PHASES + col_phase)[is_new], axis=0)
         put_max(self.pool.ravel(), cells.ravel(), values.ravel())
 
     def _phase(self, along_m: Floats, axis: int) -> tuple[Ints, Ints]:

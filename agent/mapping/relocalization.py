@@ -34,7 +34,7 @@ class Relocalization:
     def __init__(self, coarse: CoarseField, points_m: NDArray[np.float32], stamp_s: float) -> None:
         self.points_m = points_m
         self.stamp_s = stamp_s
-        self.field = halved(coarse.cells).astype(np.float32)
+        self.field = halved(coarse.blurred(coarse.first, coarse.first + coarse.empty.shape))
         self.first_m = coarse.first[::-1] * COARSE_M  # (x, y) of the field's corner
         self.next_heading = 0
         self.peaks: list[tuple[float, float, float, float]] = []  # score, x, y, theta
@@ -58,7 +58,7 @@ class Relocalization:
         cells = np.floor(turned / CELL_M + 0.5).astype(np.int64)
         half = int(np.abs(cells).max())
         kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
-        np.add.at(kernel, (cells[:, 1] + half, cells[:, 0] + half), np.float32(1.0 / (255.0 * len(cells))))
+        np.add.at(kernel, (cells[:, 1] + half, cells[:, 0] + half), np.float32(1.0 / len(cells)))
         scores = cv2.filter2D(self.field, cv2.CV_32F, kernel, borderType=cv2.BORDER_CONSTANT)
         found = []
         for _ in range(PEAKS_A_HEADING):
@@ -89,7 +89,7 @@ def is_elsewhere(a: Poses, b: Poses) -> bool:
     return bool(math.hypot(*(a - b)[:2]) > APART_M or turn > APART_RAD)
 
 
-def halved(cells: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def halved(cells: NDArray[np.float32]) -> NDArray[np.float32]:
     """Cells twice as large, each the largest of its four."""
     even = cells[: cells.shape[0] // 2 * 2, : cells.shape[1] // 2 * 2]
     return np.asarray(even.reshape(even.shape[0] // 2, 2, even.shape[1] // 2, 2).max(axis=(1, 3)))
