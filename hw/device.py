@@ -47,7 +47,11 @@ class Source(Protocol):
 Factory = Callable[[DeviceUrl, str], Source]  # (url, "lidar" | "wheels")
 
 _factories: dict[str, Factory] = {}
-_on_demand = {"sim": "hw.sim.sim_port", "log": "hw.carmen", "replay": "hw.recorder"}  # modules that register their scheme
+_on_demand = {
+    "sim": "hw.sim.sim_port",
+    "log": "hw.sim.replay_port",
+    "replay": "hw.recorder",
+}  # modules that register their scheme
 
 
 def register_scheme(scheme: str, factory: Factory) -> None:

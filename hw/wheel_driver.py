@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from hw.clock import DeviceClock
 from hw.driver import Drain, DriverBase, Pause, Reading, Script, Send
 from hw.errors import DeviceConfigError
-from hw.odometry import BaseProtocol, TickIntegrator, WheelGeometry
+from hw.odometry import BaseProtocol, TickIntegrator, TickSample, WheelGeometry
 from hw.urls import DeviceUrl
 
 GEOMETRY = ("ticks", "radius", "track")
@@ -25,6 +26,7 @@ class WheelDriver(DriverBase):
         super().__init__()
         self._protocol = protocol
         self._integrator = TickIntegrator(protocol.geometry)
+        self._clock: DeviceClock | None = None  # of a board that stamps its samples
         self.bauds = protocol.baud_rates
         self.baud = self.bauds[0]
         self.identity.model = name
@@ -46,6 +48,7 @@ class WheelDriver(DriverBase):
     def restart(self) -> None:
         """Motion while the line was down is not known."""
         self._integrator.break_here()
+        self._clock = None
 
     def poll(self) -> bytes:
         """See `Driver.poll`."""
@@ -58,8 +61,16 @@ class WheelDriver(DriverBase):
         for sample in self._protocol.feed(data):
             self._integrator.geometry = self._protocol.geometry
             self.counters.frames += 1
-            readings.append(self._integrator.add(sample, now_s))
+            readings.append(self._integrator.add(sample, self._stamp_s(sample, now_s)))
         return readings
+
+    def _stamp_s(self, sample: TickSample, arrival_s: float) -> float:
+        """When the board counted, where it has a clock; else when its bytes came."""
+        if sample.clock_s is None:
+            return arrival_s
+        if self._clock is None or sample.is_reset:
+            self._clock = DeviceClock(sample.clock_period_s)
+        return self._clock.to_host(sample.clock_s, arrival_s)
 
 
 def geometry_of(url: DeviceUrl) -> WheelGeometry | None:

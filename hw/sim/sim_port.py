@@ -1,0 +1,164 @@
+"""Where simulated devices are plugged in: a real pty for another program, or a port inside this process.
+
+PtyServer     serves any number of `ByteDevice`s, each on a pseudo-terminal behind a stable link
+SimPort       the same device as a `Port`, for `sim:office?seed=3` and `log:run.clf`
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pty
+import select
+import threading
+import time
+import tty
+from collections.abc import Iterable
+from pathlib import Path
+
+from hw.device import register_scheme
+from hw.driver import Driver
+from hw.errors import DeviceConfigError
+from hw.ld06 import Ld06
+from hw.sick_lms import SickLms
+from hw.sim.devices import ByteDevice, Ld06Lidar, RobotTicks, SickScanner, Wt1Board
+from hw.sim.robot import SimulatedRobot
+from hw.sim.world import open_world
+from hw.supervisor import Device
+from hw.urls import DeviceUrl
+from hw.wheel_driver import WheelDriver
+from hw.wheels import WheelBoard
+
+TICK_S = 0.01  # how often bytes move; a 230400 baud line carries 230 bytes in that time
+REPLAY_V_MAX_MPS = 100.0  # a recording is driven faster than any robot
+
+
+class PtyLine:
+    """One device on one pseudo-terminal behind a link whose name stays the same."""
+
+    def __init__(self, device: ByteDevice, link: Path) -> None:
+        self.device, self.link = device, link
+        self._master, slave = pty.openpty()
+        tty.setraw(slave)  # a fresh pty echoes: device bytes would come back as commands
+        os.set_blocking(self._master, False)
+        aside = link.with_name(link.name + ".new")
+        aside.unlink(missing_ok=True)
+        aside.symlink_to(os.ttyname(slave))
+        aside.replace(link)
+        os.close(slave)
+        self._poll = select.poll()
+        self._poll.register(self._master, select.POLLIN)
+
+    def pump(self, now_s: float) -> None:
+        """Move what is due in both directions; while nobody has the port open, the device talks to the air."""
+        events = dict(self._poll.poll(0)).get(self._master, 0)
+        if events & select.POLLIN:
+            with contextlib.suppress(OSError):
+                self.device.receive(os.read(self._master, 4096), now_s)
+        out = self.device.emit(now_s)
+        if out and not events & select.POLLHUP:
+            with contextlib.suppress(OSError):  # a full line loses bytes, as a serial line does
+                os.write(self._master, out)
+
+    def close(self) -> None:
+        """Unplug."""
+        self.link.unlink(missing_ok=True)
+        os.close(self._master)
+
+
+class PtyServer:
+    """A thread that keeps lines moving.  Use it in a `with`."""
+
+    def __init__(self, lines: Iterable[tuple[ByteDevice, Path]], name: str = "simulated devices") -> None:
+        self._lines = [PtyLine(device, link) for device, link in lines]
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+
+    def __enter__(self) -> PtyServer:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._stop.set()
+        self._thread.join()
+        for line in self._lines:
+            line.close()
+
+    def _run(self) -> None:
+        while not self._stop.wait(TICK_S):
+            for line in self._lines:
+                line.pump(time.monotonic())
+
+
+class SimPort:
+    """A `Port` that is a simulated device."""
+
+    def __init__(self, device: ByteDevice) -> None:
+        self._device = device
+        self._woken = threading.Event()
+
+    def read(self, timeout_s: float) -> bytes:
+        """See `Port.read`."""
+        end_s = time.monotonic() + timeout_s
+        while not (data := self._device.emit(time.monotonic())) and time.monotonic() < end_s:
+            if self._woken.wait(TICK_S / 2):
+                self._woken.clear()
+                break
+        return data
+
+    def write(self, data: bytes) -> None:
+        """See `Port.write`."""
+        self._device.receive(data, time.monotonic())
+
+    def set_baud(self, baud: int) -> None:
+        """Any rate will do."""
+
+    def set_lines(self, dtr: bool | None, rts: bool | None) -> None:
+        """There are no lines."""
+
+    def flush_input(self) -> None:
+        """Throw away what was sent before."""
+        self._device.emit(time.monotonic())
+
+    def wake(self) -> None:
+        """See `Port.wake`."""
+        self._woken.set()
+
+    def close(self) -> None:
+        """Nothing to give back."""
+
+
+_shared: dict[str, SimulatedRobot] = {}  # a LIDAR and a wheel board with the same URL sit on the same robot
+_sharing = threading.Lock()
+
+
+def _open_simulated(url: DeviceUrl, kind: str) -> Device:
+    """`sim:office?seed=3&start=1`: the world, its seed, and which of its starts."""
+    url.only(("seed", "start"))
+    seed, start = url.integer("seed", 0), url.integer("start", 0, most=63)
+    with _sharing:
+        if url.text not in _shared:
+            world = open_world(url.path if "seed" not in url.options else f"{url.path}?seed={seed}")
+            robot = SimulatedRobot(world, world.start_poses(start + 1, seed)[start], 64 * seed + start)
+            robot.begin()
+            _shared[url.text] = robot
+        robot = _shared[url.text]
+    if kind == "lidar":
+        return _device(url, Ld06(), Ld06Lidar(robot, seed=seed))
+    return _device(url, WheelDriver(WheelBoard(), "simulated wheels"), Wt1Board(RobotTicks(robot)))
+
+
+def _device(url: DeviceUrl, driver: Driver, simulated: ByteDevice) -> Device:
+    return Device(url.text, driver, lambda baud, dtr: SimPort(simulated), url.text)
+
+
+def replay_device(url: DeviceUrl, kind: str, scanner: SickScanner, board: ByteDevice) -> Device:
+    """The LIDAR or the wheels of a recording, as a device inside this process."""
+    if kind == "lidar":
+        return _device(url, SickLms(SickScanner.baud), scanner)
+    if kind == "wheels":
+        return _device(url, WheelDriver(WheelBoard(None, REPLAY_V_MAX_MPS), "recorded wheels"), board)
+    raise DeviceConfigError(f"{url.text}: a recording has a lidar and wheels, no {kind}")
+
+
+register_scheme("sim", _open_simulated)
