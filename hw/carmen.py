@@ -3,10 +3,10 @@
     FLASER n r_1 ... r_n  x y theta  odom_x odom_y odom_theta  stamp host logger_stamp
     ODOM x y theta tv rv accel  stamp host logger_stamp
 
-Ranges are in metres, counter-clockwise from the right.  In the Radish recordings `x y theta` of a FLASER is a pose
-*corrected* by somebody's filter, and the wheel odometry restarts at every corrected pose.  The raw motion from one scan to the next is therefore the last ODOM before the second scan relative to
-the FLASER pose of the first; chaining these motions gives raw odometry, and the corrected pose is never handed on except as
-`T_map_laser`, the reference that benchmarks compare with.
+Ranges are in metres, counter-clockwise from the right. In the Radish recordings `x y theta` of a FLASER is a pose *corrected*
+by somebody's filter, and the wheel odometry restarts at every corrected pose. The raw motion from one scan to the next is
+therefore the last ODOM before the second scan relative to the FLASER pose of the first; chaining these motions gives raw
+odometry, and the corrected pose is never handed on except as `T_map_laser`, the reference that benchmarks compare with.
 """
 
 from __future__ import annotations
