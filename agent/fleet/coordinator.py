@@ -311,7 +311,7 @@ class Coordinator:
         before = peer.map
         if not self._ledger.roster.accept_beat(peer, beat, now_s):
             return
-        if peer.presence is Presence.LOST:
+        if peer.presence is not Presence.ALIVE:
             self._fetching.forget(peer.robot)
         self._check_frame(peer, before, now_s)
 

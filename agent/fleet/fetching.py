@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from agent.fleet.effects import Fetch
 from agent.fleet.ledger import Ledger
 
-_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 20.0
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 8.0
 BULK = frozenset({"coarse", "fine", "tiles"})
 
 
@@ -53,7 +53,7 @@ class Fetching:
             return None
         del self._running[name]
         if is_good:
-            self._patience.pop(name, None)
+            self.forget(fetch.peer)  # it answers again
         else:
             patience = self._patience.setdefault(name, _Patience())
             patience.failures += 1

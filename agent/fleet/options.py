@@ -23,6 +23,7 @@ class FleetOptions:
     max_small_fetches: int = 8
     retry_growth: float = 0.10  # a pair that did not fit is tried again when a map has grown by this share
     retry_period_s: float = 3.0  # and not sooner than this
+    retry_change_s: float = 20.0  # a pair whose maps changed without growing is tried again after this long
     reverify_growth: float = 0.05  # a live edge is checked again when a map has grown by this share
     reverify_period_s: float = 3.0
     renew_growth: float = 0.30  # a live edge is proposed anew, with better figures, when the overlap has grown by this

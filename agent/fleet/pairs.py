@@ -51,6 +51,7 @@ class Attempt:
 
     at_s: float
     area_m2: float
+    digests: tuple[bytes, bytes] = (b"", b"")  # of ours and theirs
 
 
 @dataclass(slots=True)
@@ -160,7 +161,7 @@ class PairWork:
         edges = sum(self._ledger.robot in key for key in self._ledger.live)
         if not _is_in_frame(peer) or edges >= self._ledger.options.max_edges:
             return None
-        if not self._has_grown(pair.loop, self._area_m2(peer), now_s):
+        if not self._is_due(pair.loop, self._area_m2(peer), peer.held, now_s):
             return None
         return Purpose.LOOP, None, group.T_root[self._ledger.robot].inverse() @ group.T_root[peer.robot]
 
@@ -168,11 +169,11 @@ class PairWork:
         """A stranger: the coarse map first, the cells when that looks hopeful, then the search."""
         options = self._ledger.options
         if _is_in_frame(peer):
-            if not self._has_grown(pair.search, self._ledger.own.known_area_m2 + peer.known_area_m2, now_s):
+            if not self._is_due(pair.search, self._ledger.own.known_area_m2 + peer.known_area_m2, peer.map, now_s):
                 return None
             if peer.held != peer.map:
                 pair.wants_fine = True  # grown since: search on the newest
-                if not self._has_grown(pair.search, self._area_m2(peer), now_s):
+                if not self._is_due(pair.search, self._area_m2(peer), peer.held, now_s):
                     return None
             return (Purpose.HINT, None, pair.hint) if pair.hint else (Purpose.SEARCH, None, None)
         announced = peer.announcement
@@ -181,7 +182,7 @@ class PairWork:
         if announced.fine_bytes <= options.coarse_skip_bytes or pair.phase == "hopeful" or pair.coarse_misses >= 3:
             pair.wants_fine = True
             return None
-        if not self._has_grown(pair.coarse, self._ledger.own.known_area_m2 + peer.known_area_m2, now_s):
+        if not self._is_due(pair.coarse, self._ledger.own.known_area_m2 + peer.known_area_m2, peer.map, now_s):
             return None
         if (
             peer.coarse is None
@@ -224,11 +225,15 @@ class PairWork:
         has_grown = self._area_m2(peer) >= pair.checked.area_m2 * (1.0 + options.reverify_growth)
         return has_grown and now_s - pair.checked.at_s >= options.reverify_period_s
 
-    def _has_grown(self, attempt: Attempt | None, area_m2: float, now_s: float) -> bool:
-        options = self._ledger.options
-        if attempt is None:
+    def _is_due(self, attempt: Attempt | None, area_m2: float, theirs: MapVersion | None, now_s: float) -> bool:
+        """Whether there is more map than last time; or any other map at all, after a long while."""
+        options, own = self._ledger.options, self._ledger.own.version
+        if attempt is None or own is None or theirs is None:
+            return attempt is None
+        waited_s = now_s - attempt.at_s
+        if waited_s >= options.retry_change_s and (own.digest, theirs.digest) != attempt.digests:
             return True
-        return area_m2 >= attempt.area_m2 * (1.0 + options.retry_growth) and now_s - attempt.at_s >= options.retry_period_s
+        return waited_s >= options.retry_period_s and area_m2 >= attempt.area_m2 * (1.0 + options.retry_growth)
 
     def _area_m2(self, peer: Peer) -> float:
         """Map there is to compare: ours, and theirs as held here."""
@@ -270,7 +275,7 @@ class PairWork:
         pair = self.pair(job.peer)
         pair.match_factor, pair.reason = result.factor.value, result.reason
         self._note_attempt(running, result)
-        attempt = Attempt(now_s, running.area_m2)
+        attempt = Attempt(now_s, running.area_m2, (running.ours.digest, running.theirs.digest))
         match running.purpose:
             case Purpose.COARSE:
                 self._on_coarse(pair, running, result, attempt)

@@ -1,6 +1,6 @@
-"""C4 in simulation: thousands of seeded days of a fleet, each with loss, delay, partition, crash, restart, twins and wrong clocks.
+"""C4 in simulation: thousands of seeded days of a fleet: loss, delay, partition, crash, restart, twins, wrong clocks.
 
-    .venv/bin/python -m tests.campaigns.fleet_schedules [--schedules 10000] [--first 0] [--processes 2] [--json out/fleet_schedules.json]
+    .venv/bin/python -m tests.campaigns.fleet_schedules [--schedules 10000] [--first 0] [--processes 2] [--json FILE]
 
 Every schedule checks the invariants of `tests/fleet/schedules.py` while it runs and after its faults have stopped.  A failing
 one is replayed with `--first SEED --schedules 1`.
