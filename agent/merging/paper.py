@@ -47,8 +47,9 @@ class SimilarFeatures:
 
 def match_maps_like_the_paper(ours: MapSnapshot, theirs: MapSnapshot, options: MatchOptions) -> MergeResult:
     """`method = "paper"`, and `"paper-guarded"`."""
-    guarded = options.method == "paper-guarded"
-    return (match_guarded if guarded else match_by_the_paper)(ours.grid, theirs.grid, options)
+    if options.method == "paper-guarded":
+        return match_guarded(ours, theirs, options)
+    return match_by_the_paper(ours.grid, theirs.grid, options)
 
 
 def match_by_the_paper(ours: OccupancyGrid, theirs: OccupancyGrid, options: MatchOptions) -> MergeResult:
@@ -70,9 +71,9 @@ def match_by_the_paper(ours: OccupancyGrid, theirs: OccupancyGrid, options: Matc
     )
 
 
-def match_guarded(ours: OccupancyGrid, theirs: OccupancyGrid, options: MatchOptions) -> MergeResult:
+def match_guarded(ours: MapSnapshot, theirs: MapSnapshot, options: MatchOptions) -> MergeResult:
     """Algorithm 1's candidates, chosen and judged with the guards of `paper_guard.py`."""
-    return choose_guarded(ours, theirs, paper_candidates(ours, theirs, options), options)
+    return choose_guarded(ours, theirs, paper_candidates(ours.grid, theirs.grid, options), options)
 
 
 def paper_candidates(ours: OccupancyGrid, theirs: OccupancyGrid, options: MatchOptions) -> list[Candidate]:

@@ -1,18 +1,20 @@
-"""The paper's candidates with three guards it does not have: `method = "paper-guarded"`.
+"""The paper's candidates with four guards it does not have: `method = "paper-guarded"`.
 
 1. a tenth of the smaller map must overlap, so that slivers drop out;
 2. candidates are ranked by metres of wall that fall on wall, less twice those that fall on the other map's free space;
-3. the best must beat every distinct alternative by metres of wall and by ratio: a corridor that fits in two places stays apart.
+3. the best must beat every distinct alternative by metres of wall and by ratio: a corridor that fits in two places stays apart;
+4. once refined below the bins of the vote, it must pass the judge of the hybrid method (`verify_match`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.features.snapshot import MapSnapshot
 from agent.merging.equations import BIN_COVARIANCE, Candidate, overlap_m2
 from agent.merging.result import Alternative, MatchOptions, MatchStatus, MergeResult, Reason
 from protocol.geometry import SE2, wrap_angle
@@ -27,25 +29,25 @@ DISTINCT_M, DISTINCT_RAD = 0.8, 0.105  # candidates nearer than this (6 degrees)
 _MAX_POINTS = 2000  # a map: enough to weigh 100 m of wall to 5 %
 
 
-def choose_guarded(ours: OccupancyGrid, theirs: OccupancyGrid, candidates: list[Candidate], options: MatchOptions) -> MergeResult:
+def choose_guarded(ours: MapSnapshot, theirs: MapSnapshot, candidates: list[Candidate], options: MatchOptions) -> MergeResult:
     """The verdict on the paper's candidates; NO and AMBIGUOUS carry the best hypothesis and the numbers."""
-    smaller_m2 = min(ours.known_area_m2(), theirs.known_area_m2())
-    wide = [c for c in candidates if overlap_m2(c.factor, ours) >= MIN_OVERLAP * smaller_m2]
+    smaller_m2 = min(ours.grid.known_area_m2(), theirs.grid.known_area_m2())
+    wide = [c for c in candidates if overlap_m2(c.factor, ours.grid) >= MIN_OVERLAP * smaller_m2]
     if not wide:
         return MergeResult.none(Reason.NO_CANDIDATES)
-    scale = WallScale.of(ours, theirs)
+    scale = WallScale.of(ours.grid, theirs.grid)
     weighed = sorted(((scale.weigh(c.T_ours_theirs), c) for c in wide), key=lambda pair: -pair[0].score_m)
     weight, best = weighed[0]
-    centre = theirs.points_of(np.argwhere(theirs.known()).mean(axis=0, keepdims=True))
+    centre = theirs.grid.points_of(np.argwhere(theirs.grid.known()).mean(axis=0, keepdims=True))
     rivals = [(w, c) for w, c in weighed[1:] if _is_distinct(best.T_ours_theirs, c.T_ours_theirs, centre)][:5]
     rival_m = max(0.0, rivals[0][0].score_m) if rivals else 0.0
     status, reason = _verdict(best, weight, rival_m, options)
-    return MergeResult(
+    result = MergeResult(
         status,
         best.T_ours_theirs,
         BIN_COVARIANCE,
         factor=best.factor,
-        overlap_m2=overlap_m2(best.factor, ours),
+        overlap_m2=overlap_m2(best.factor, ours.grid),
         score=weight.score_m,
         runner_up_score=rival_m,
         candidates_tried=len(candidates),
@@ -53,6 +55,18 @@ def choose_guarded(ours: OccupancyGrid, theirs: OccupancyGrid, candidates: list[
         alternatives=tuple(Alternative(c.T_ours_theirs, w.score_m) for w, c in rivals),
         evidence={"agreeing_wall_m": weight.agreeing_m, "conflicting_wall_m": weight.conflicting_m},
     )
+    return _verified(ours, theirs, result, options) if result.accepted else result
+
+
+def _verified(ours: MapSnapshot, theirs: MapSnapshot, result: MergeResult, options: MatchOptions) -> MergeResult:
+    """The result refined, if the hybrid's judge agrees; else a NO with that judge's reason."""
+    from agent.merging.matching import verify_match  # noqa: PLC0415  (matching dispatches to this module)
+
+    assert result.T_ours_theirs is not None
+    judged = verify_match(ours, theirs, result.T_ours_theirs, options)
+    if not judged.accepted:
+        return replace(result, status=MatchStatus.NO, reason=judged.reason)
+    return replace(result, T_ours_theirs=judged.T_ours_theirs, covariance=judged.covariance)
 
 
 def _verdict(best: Candidate, weight: Weight, rival_m: float, options: MatchOptions) -> tuple[MatchStatus, str]:

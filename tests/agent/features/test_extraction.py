@@ -116,7 +116,7 @@ def test_straight_walls_are_never_round():
         assert len(features.circles) == len(features.arcs) == 0
 
 
-@settings(max_examples=60)
+@settings(max_examples=60, deadline=None)
 @given(any_cells)
 def test_no_cells_whatever_upset_it(cells):
     features = extract_features(OccupancyGrid(cells, 0.1))

@@ -7,7 +7,7 @@ import math
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -66,6 +66,7 @@ def test_features_of_a_floor_plan_are_few_and_long(resolution_m):
     assert features.lines[:, 2].sum() > 60
 
 
+@settings(deadline=None)
 @given(any_cells)
 def test_no_cells_whatever_upset_it(cells):
     for kind in (features := paper_features(OccupancyGrid(cells, 0.1))).lines, features.circles, features.curves:

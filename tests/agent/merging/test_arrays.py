@@ -34,7 +34,7 @@ def test_probabilities_between_are_read_with_nav2s_thresholds():
     assert fused.grid.cells.tolist() == [[0, 0, -1], [-1, 100, 100]]
 
 
-@settings(max_examples=40)
+@settings(max_examples=40, deadline=None)
 @given(any_cells, any_cells)
 def test_no_arrays_whatever_upset_it(a, b):
     result = merge_arrays(a, b, 0.05, 0.1)

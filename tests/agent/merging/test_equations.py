@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -27,6 +27,7 @@ grids = st.builds(
 transforms = st.builds(SE2, st.floats(-2, 2), st.floats(-2, 2), st.floats(-7, 7))
 
 
+@settings(deadline=None)
 @given(grids, grids, transforms)
 def test_fast_counts_are_the_obvious_counts(ours, theirs, T_ours_theirs):
     agree, disagree, on_an_edge = match_factor_counts(ours, theirs, T_ours_theirs)
@@ -35,6 +36,7 @@ def test_fast_counts_are_the_obvious_counts(ours, theirs, T_ours_theirs):
     assert abs(factor.disagree - disagree) <= on_an_edge
 
 
+@settings(deadline=None)
 @given(grids, st.integers(-20, 20), st.integers(-20, 20), st.integers(0, 3))
 def test_whole_cells_and_quarter_turns_are_exact(grid, rows, cols, quarter_turns):
     theirs = OccupancyGrid(np.rot90(grid.cells, quarter_turns), 1.0)

@@ -7,7 +7,7 @@ import math
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -45,6 +45,7 @@ small_grids = st.builds(
 placed_grids = st.tuples(small_grids, st.builds(SE2, st.floats(-2, 2), st.floats(-2, 2), st.floats(-7, 7)))
 
 
+@settings(deadline=None)
 @given(st.lists(placed_grids, min_size=1, max_size=4), st.randoms(use_true_random=False))
 def test_the_order_in_which_maps_join_never_changes_a_bit(maps, random):
     shuffled = random.sample(maps, len(maps))
@@ -52,6 +53,7 @@ def test_the_order_in_which_maps_join_never_changes_a_bit(maps, random):
     assert fuse(maps).conflicting_cells == fuse(shuffled).conflicting_cells
 
 
+@settings(deadline=None)
 @given(placed_grids)
 def test_a_map_always_agrees_with_itself(placed):
     once, twice = fuse([placed]), fuse([placed, placed])
@@ -60,6 +62,7 @@ def test_a_map_always_agrees_with_itself(placed):
     assert twice.agreeing_cells == np.count_nonzero(once.grid.known())
 
 
+@settings(deadline=None)
 @given(st.lists(placed_grids, min_size=2, max_size=4))
 def test_fusion_invents_no_knowledge(maps):
     fused = fuse(maps).grid

@@ -1,0 +1,111 @@
+"""Figures of the paper's own kind (agreement, disagreement, match factor, candidates, time), its method beside ours.
+
+.venv/bin/python -m tests.bench.paper_figures            simulated pairs, and pairs of the recordings when the kit is built
+.venv/bin/python -m tests.bench.paper_figures --json     the same rows as JSON
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+from collections.abc import Iterable
+from itertools import chain
+from typing import Any
+
+import cv2
+import numpy as np
+
+from agent.features.paper import paper_features
+from agent.features.snapshot import MapSnapshot
+from agent.merging.matching import match_maps
+from agent.merging.result import MatchOptions
+from tests.bench.map_pairs import MapPair, kit_pairs, simulated_pairs
+
+METHODS = ("paper", "paper-guarded", "hybrid")
+WORLDS = ["office?seed=1", "office?seed=2", "office?seed=3", "random?seed=1", "random?seed=2", "outdoor?seed=1"]
+
+
+def measured(pair: MapPair, method: str) -> dict[str, Any]:
+    started = time.process_time()
+    result = match_maps(MapSnapshot.of(pair.ours), MapSnapshot.of(pair.theirs), MatchOptions(method=method))
+    cpu_ms = (time.process_time() - started) * 1e3
+    T = result.T_ours_theirs
+    is_right = T is not None and pair.is_right(T)
+    metres, radians = pair.errors(T) if T is not None and is_right else (math.nan, math.nan)
+    return {
+        "pair": pair.name,
+        "should_merge": pair.truth is not None,
+        "method": method,
+        "features": [len(paper_features(pair.ours)), len(paper_features(pair.theirs))],
+        "candidates": result.candidates_tried,
+        "agree": result.factor.agree,
+        "disagree": result.factor.disagree,
+        "match_factor": round(result.factor.value, 4),
+        "verdict": str(result.status),
+        "is_right": is_right,
+        "error_cm": None if math.isnan(metres) else round(100 * metres, 1),
+        "error_deg": None if math.isnan(radians) else round(math.degrees(radians), 2),
+        "cpu_ms": round(cpu_ms, 1),
+    }
+
+
+def as_markdown(rows: list[dict[str, Any]]) -> str:
+    lines = [
+        "| pair | features | method | candidates | agr | dis | MF | verdict | right? | error cm / deg | CPU ms |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for r in rows:
+        error = "-" if r["error_cm"] is None else f"{r['error_cm']} / {r['error_deg']}"
+        lines.append(
+            f"| {r['pair']} | {r['features'][0]}, {r['features'][1]} | {r['method']} | {r['candidates']} | {r['agree']} | "
+            f"{r['disagree']} | {r['match_factor']:.3f} | {r['verdict']} | {judged(r)} | {error} | {r['cpu_ms']:.0f} |"
+        )
+    return "\n".join(lines)
+
+
+def judged(row: dict[str, Any]) -> str:
+    if row["verdict"] == "merged":
+        return "right" if row["is_right"] else "**WRONG**"
+    return "missed" if row["should_merge"] else "right"
+
+
+def summary(rows: list[dict[str, Any]]) -> str:
+    lines = [
+        "| method | fitting pairs: right / wrong / not merged | strangers merged | CPU ms median (slowest tenth) |",
+        "|---|---|---|---|",
+    ]
+    for method in METHODS:
+        mine = [r for r in rows if r["method"] == method]
+        fit, unfit = [r for r in mine if r["should_merge"]], [r for r in mine if not r["should_merge"]]
+        right, wrong = (sum(judged(r) == word for r in fit) for word in ("right", "**WRONG**"))
+        false = sum(r["verdict"] == "merged" for r in unfit)
+        cpu = [r["cpu_ms"] for r in mine]
+        lines.append(
+            f"| {method} | {right} / {wrong} / {len(fit) - right - wrong} of {len(fit)} | {false} of {len(unfit)} | "
+            f"{np.median(cpu):.0f} ({np.percentile(cpu, 90):.0f}) |"
+        )
+    return "\n".join(lines)
+
+
+def all_pairs(kit_stride: int) -> Iterable[MapPair]:
+    simulated = chain(simulated_pairs(WORLDS, 0.05), simulated_pairs(WORLDS[:2], 0.2))
+    recorded = chain(
+        kit_pairs("main", "pos", kit_stride), kit_pairs("res20", "pos", 2 * kit_stride), kit_pairs("main", "neg", kit_stride)
+    )
+    return chain(simulated, recorded)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--kit-stride", type=int, default=6, help="every N-th pair of the kit (default 6)")
+    args = parser.parse_args()
+    cv2.setNumThreads(1)
+    rows = [measured(pair, method) for pair in all_pairs(args.kit_stride) for method in METHODS]
+    print(json.dumps(rows, indent=1) if args.json else f"{as_markdown(rows)}\n\n{summary(rows)}")
+
+
+if __name__ == "__main__":
+    main()
