@@ -42,6 +42,9 @@ MODELS = {
     "stl27l": Model("STL-27L", 921600, 21600, 25.0),
 }
 RANGE_MIN_M = 0.02
+LEAST_DPS, MOST_DPS = 360, 7200  # 1 to 20 turns a second
+MOST_FRAME_S = 0.02  # for twelve beams: 600 samples a second, a quarter of what the slowest one takes
+LOOSE_SPAN, STRICT_SPAN = 0.5, 0.03  # the vendor's own limit, and that on a line that is not clean
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,6 +137,7 @@ class Ld06(FixedFrameLidar):
         self.baud = self.model.baud
         self._clock = DeviceClock(CLOCK_PERIOD_S)
         self._last_start_cdeg = 0
+        self._frame_s = 0.0  # usual time from the first beam of a frame to its last
 
     def restart(self) -> None:
         """See `Driver.restart`."""
@@ -145,19 +149,21 @@ class Ld06(FixedFrameLidar):
         self._last_start_cdeg = start_cdeg = _u16(last, 4)
         return start_cdeg < before or _u16(last, 42) < start_cdeg
 
-    def _follow(self, data: Bytes) -> NDArray[np.bool_]:
+    def _follow(self, data: Bytes, is_strict: bool) -> NDArray[np.bool_]:
         start_cdeg = data[:, 4].astype(np.int64) | data[:, 5].astype(np.int64) << 8
         end_cdeg = data[:, 42].astype(np.int64) | data[:, 43].astype(np.int64) << 8
         step_cdeg = (end_cdeg - start_cdeg) % 36000 / (BEAMS - 1)
         between_cdeg = (start_cdeg[1:] - end_cdeg[:-1]) % 36000
-        follows: NDArray[np.bool_] = between_cdeg <= 2.5 * np.minimum(step_cdeg[1:], step_cdeg[:-1]) + 10
+        usual_cdeg = np.minimum(step_cdeg[1:], step_cdeg[:-1])
+        off_cdeg = np.abs(between_cdeg - usual_cdeg)
+        follows: NDArray[np.bool_] = off_cdeg <= (0.15 * usual_cdeg + 4 if is_strict else 1.5 * usual_cdeg + 10)
         return follows
 
     def _beams(self, frames: Bytes, gaps: NDArray[np.int64], arrivals_s: NDArray[np.float64]) -> Beams:
         head = np.ascontiguousarray(frames[:, 2:6]).view("<u2").astype(np.float64)  # speed, start
         tail = np.ascontiguousarray(frames[:, 42:46]).view("<u2").astype(np.float64)  # end, ms
         span_cdeg = (tail[:, 0] - head[:, 1]) % 36000.0
-        is_sane = self._plausible(head[:, 0], head[:, 1], span_cdeg, tail[:, 0], tail[:, 1])
+        is_sane = (head[:, 1] < 36000) & (tail[:, 0] < 36000) & (tail[:, 1] <= 30000) & self._turns_evenly(head[:, 0], span_cdeg)
         self.counters.rejected += int(np.count_nonzero(~is_sane))
         dirty = (gaps > 0) | ~is_sane
         frames, arrivals_s = frames[is_sane], arrivals_s[is_sane]
@@ -182,22 +188,14 @@ class Ld06(FixedFrameLidar):
             is_dirty=np.repeat(carried(dirty, is_sane), BEAMS),
         )
 
-    def _plausible(
-        self,
-        speed_dps: NDArray[np.float64],
-        start_cdeg: NDArray[np.float64],
-        span_cdeg: NDArray[np.float64],
-        end_cdeg: NDArray[np.float64],
-        clock_ms: NDArray[np.float64],
-    ) -> NDArray[np.bool_]:
-        """Which frames can be true: angles on the circle, a motor that turns, and beams as dense as speed and sample rate say."""
-        expected_cdeg = speed_dps * (100.0 * (BEAMS - 1) / self.model.samples_per_s)
-        return (
-            (start_cdeg < 36000)
-            & (end_cdeg < 36000)
-            & (clock_ms <= 30000)
-            & (speed_dps > 360)
-            & (speed_dps < 360 * 20)
-            & (span_cdeg < 1.5 * expected_cdeg + 20)
-            & (span_cdeg > 0.5 * expected_cdeg - 20)
-        )
+    def _turns_evenly(self, speed_dps: NDArray[np.float64], span_cdeg: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which frames span what their speed makes of the usual time for twelve beams."""
+        frame_s = span_cdeg / 100.0 / np.maximum(speed_dps, 1.0)
+        can_be = (speed_dps > LEAST_DPS) & (speed_dps < MOST_DPS) & (frame_s > 0) & (frame_s < MOST_FRAME_S)
+        if can_be.any():
+            now_s = float(np.median(frame_s[can_be]))
+            has_changed = can_be.sum() >= 8 and abs(now_s - self._frame_s) > 0.1 * self._frame_s
+            self._frame_s = now_s if has_changed or not self._frame_s else 0.9 * self._frame_s + 0.1 * now_s
+        tolerance = STRICT_SPAN if self._is_strict else LOOSE_SPAN
+        is_even: NDArray[np.bool_] = can_be & (np.abs(frame_s - self._frame_s) <= tolerance * self._frame_s)
+        return is_even

@@ -135,7 +135,7 @@ class ScanAssembler:
                 (ranges_m < self.range_min_m) | ((ranges_m > self.range_max_m) & np.isfinite(ranges_m)), np.nan, ranges_m
             )
         if must_filter:
-            ranges_m = supported_only(ranges_m, self.witnesses)
+            ranges_m = np.where(is_evenly_spaced(beams.angles_rad), supported_only(ranges_m, self.witnesses), np.nan)
         offsets_s = np.maximum.accumulate(beams.stamps_s - beams.stamps_s[0])
         return LaserScan(
             stamp_s=float(beams.stamps_s[0]),
@@ -189,3 +189,13 @@ def supported_only(ranges_m: Floats, steps: tuple[int, ...] = (1,)) -> Floats:
             stands &= np.abs(before - after) <= step * (NEIGHBOURS_M + NEIGHBOURS_SHARE * ranges_m)
             stands &= np.abs(ranges_m - (before + after) / 2) <= NOISE_M + NOISE_SHARE * ranges_m
     return np.where(stands, ranges_m, np.nan)
+
+
+UNEVEN_RAD = np.radians(0.2)  # 2 cm at 5 m
+
+
+def is_evenly_spaced(angles_rad: Floats) -> NDArray[np.bool_]:
+    """Which beams lie midway between their neighbours in angle: where a device sends angles, they too can be damaged."""
+    step = np.remainder(np.diff(angles_rad, prepend=angles_rad[-1:]) + np.pi, 2 * np.pi) - np.pi
+    even: NDArray[np.bool_] = np.abs(np.roll(step, -1) - step) <= 2 * UNEVEN_RAD
+    return even

@@ -21,6 +21,7 @@ Ints = NDArray[np.int64]
 
 PACE_S = 1.0  # over how long the true rate of bytes is measured
 PACE_GAP_S = 0.2  # a longer silence is no pace
+STRICT_ABOVE = 0.02  # share of frames with damage before them from which angles must fit closely, as quiet devices' do
 HOLD_AT_MOST = 256  # frames: bounds delay and memory when no revolution ends
 
 
@@ -72,6 +73,7 @@ class SpinningLidar(DriverBase):
         self._held: list[Frames] = []
         self._held_arrivals_s: list[Floats] = []
         self._due = 0
+        self._is_strict = False
         self._last: _Waiting | None = None
         self._pace = Pace()
 
@@ -141,15 +143,18 @@ class SpinningLidar(DriverBase):
         if self._last is not None:
             data, gaps = np.concatenate([self._last.data, data]), np.concatenate([self._last.gaps, gaps])
             arrivals_s = np.concatenate([self._last.arrivals_s, arrivals_s])
-        follows = np.concatenate([[self._last is not None and self._last.follows], self._follow(data) & (gaps[1:] == 0)])
+        self._is_strict = float(np.mean(gaps > 0)) > STRICT_ABOVE
+        follows = np.concatenate(
+            [[self._last is not None and self._last.follows], self._follow(data, self._is_strict) & (gaps[1:] == 0)]
+        )
         self._last = _Waiting(data[-1:], gaps[-1:], arrivals_s[-1:], bool(follows[-1]))
         is_seen = follows[:-1] | follows[1:]
         self.counters.rejected += int(np.count_nonzero(~is_seen))
         dirty = carried((gaps[:-1] > 0) | ~is_seen, is_seen)
         return data[:-1][is_seen], dirty.astype(np.int64), arrivals_s[:-1][is_seen]
 
-    def _follow(self, data: Bytes) -> NDArray[np.bool_]:
-        """Which frames begin where the one before ended: (M,) frames to (M - 1,)."""
+    def _follow(self, data: Bytes, is_strict: bool) -> NDArray[np.bool_]:
+        """Which frames begin where the one before ended: (M,) frames to (M - 1,); strictly on a line that is not clean."""
         raise NotImplementedError
 
     def _beams(self, frames: Bytes, gaps: Ints, arrivals_s: Floats) -> Beams:

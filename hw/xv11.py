@@ -157,7 +157,7 @@ class Xv11(FixedFrameLidar):
         before, self._last_index = self._last_index, int(frames.data[-1, 1])
         return self._last_index <= before
 
-    def _follow(self, data: Bytes) -> NDArray[np.bool_]:
+    def _follow(self, data: Bytes, is_strict: bool) -> NDArray[np.bool_]:
         index = data[:, 1].astype(np.int64)
         follows: NDArray[np.bool_] = (index[1:] - index[:-1]) % self.kind.packets == 1
         return follows

@@ -22,7 +22,7 @@ from hw.errors import DeviceError, DeviceSilent
 from hw.framing import Bytes, Frames, SizedFrames
 from hw.rplidar_wire import Descriptor, xor8
 from hw.scan_assembler import Beams
-from hw.spinning import SpinningLidar, carried
+from hw.spinning import Floats, Ints, SpinningLidar, carried
 
 HEADER = b"\xaa\x55"
 CLOCK_HEADER = b"\xaa\x66"
@@ -135,7 +135,7 @@ def command(code: int) -> bytes:
     return bytes((0xA5, code))
 
 
-def correction_deg(mm: NDArray[np.float64]) -> NDArray[np.float64]:
+def correction_deg(mm: Floats) -> Floats:
     """The second-level angle correction of triangulating units, to add to the clockwise angle; 0 where nothing was seen."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(mm > 0, np.degrees(np.arctan(21.8 * (155.3 - mm) / (155.3 * mm))), 0.0)
@@ -268,13 +268,25 @@ class YdLidar(SpinningLidar):
                 return size
         return 0
 
-    def _follow(self, data: Bytes) -> NDArray[np.bool_]:
+    def _follow(self, data: Bytes, is_strict: bool) -> NDArray[np.bool_]:
         angles_deg = np.floor(np.ascontiguousarray(data[:, 4:8]).view("<u2") / 2) / 64
+        self._learn_step(angles_deg, data[:, 3].astype(np.int64))
         between_deg = (angles_deg[1:, 0] - angles_deg[:-1, 1] + 180) % 360 - 180
-        follows: NDArray[np.bool_] = (between_deg > -0.3) & (between_deg < 4 * (self._usual_step_deg or MOST_STEP_DEG) + 0.5)
+        usual_deg = self._usual_step_deg
+        least_deg, most_deg = (usual_deg - 0.25, usual_deg + 0.25) if is_strict else (-0.3, 4 * usual_deg + 0.5)
+        follows: NDArray[np.bool_] = (between_deg > least_deg) & (between_deg < most_deg)
         return follows
 
-    def _beams(self, frames: Bytes, gaps: NDArray[np.int64], arrivals_s: NDArray[np.float64]) -> Beams:
+    def _learn_step(self, angles_deg: Floats, n: Ints) -> None:
+        """The usual angle between samples, from packets long enough to tell."""
+        step_deg = (angles_deg[:, 1] - angles_deg[:, 0]) % 360.0 / np.maximum(n - 1, 1)
+        told = step_deg[(n > 4) & (step_deg < MOST_STEP_DEG) & (step_deg > 0)]
+        if len(told):
+            usual_deg = float(np.median(told))
+            has_changed = len(told) >= 4 and abs(usual_deg - self._usual_step_deg) > 0.1 * self._usual_step_deg
+            self._usual_step_deg = usual_deg if has_changed else 0.8 * self._usual_step_deg + 0.2 * usual_deg
+
+    def _beams(self, frames: Bytes, gaps: Ints, arrivals_s: Floats) -> Beams:
         head = np.ascontiguousarray(frames[:, 4:8]).view("<u2").astype(np.float64)
         n = frames[:, 3].astype(np.int64)
         first_deg, last_deg = np.floor(head[:, 0] / 2) / 64, np.floor(head[:, 1] / 2) / 64
@@ -305,7 +317,7 @@ class YdLidar(SpinningLidar):
             is_dirty=np.repeat(dirty, n),
         )
 
-    def _samples(self, frames: Bytes) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _samples(self, frames: Bytes) -> tuple[Floats, Floats]:
         """Millimetres and intensities, (M, 80) each."""
         width = self._width or 2
         values = (
@@ -320,16 +332,15 @@ class YdLidar(SpinningLidar):
             intensities = values[:, :, 0] | ((word & 3) << 8 if self._intensity_bits == 10 else 0)
         return mm, intensities.astype(np.float64)
 
-    def _are_sane(
-        self, first_deg: NDArray[np.float64], last_deg: NDArray[np.float64], step_deg: NDArray[np.float64], n: NDArray[np.int64]
-    ) -> NDArray[np.bool_]:
+    def _are_sane(self, first_deg: Floats, last_deg: Floats, step_deg: Floats, n: Ints) -> NDArray[np.bool_]:
         """Which packets can be true: angles on the circle, samples as dense as usual (one backwards spans the circle)."""
         can_be = (first_deg < 360) & (last_deg < 360) & (step_deg < MOST_STEP_DEG)
-        long = can_be & (n > 4)
-        if long.any():
-            usual = float(np.median(step_deg[long]))
-            self._usual_step_deg = usual if not self._usual_step_deg else 0.8 * self._usual_step_deg + 0.2 * usual
-        is_sane: NDArray[np.bool_] = can_be & ((n <= 4) | (step_deg < 2 * self._usual_step_deg))
+        usual_deg = self._usual_step_deg
+        if self._is_strict:
+            fits = np.abs(step_deg - usual_deg) * (n - 1) < 0.01 * usual_deg * n + 0.05
+        else:
+            fits = step_deg < 2 * usual_deg
+        is_sane: NDArray[np.bool_] = can_be & ((n <= 4) | fits)
         self.counters.rejected += int(np.count_nonzero(~is_sane))
         return is_sane
 
