@@ -23,6 +23,7 @@ from hw.carmen import RecordedScan, Recording
 from protocol.geometry import SE2, wrap_angle
 
 STILL_S = 0.08
+STOP_S = 0.004  # after a phase the board says once more where it stands, so that nobody extrapolates its last speed
 SPEED_MPS, TURN_RAD_S = 2.5, 3.5  # at speed 1: within what any mapper takes for motion
 TICKS_PER_REVOLUTION, WHEEL_RADIUS_UM, TRACK_UM = 60000, 50_000, 300_000
 NOTHING_CM = 0x1FFF
@@ -66,6 +67,7 @@ class Replay:
                     self._event(now_s, rolled)
                 if scan.motion is None:
                     self.reset_times_s.add(now_s)
+                self._event(now_s + STOP_S, rolled)
                 now_s += STILL_S / 2
             self.scan_times_s.append(now_s)
             now_s += STILL_S / 2
