@@ -55,9 +55,6 @@ class Replay:
         """Seconds since `begin`; negative before."""
         return -1.0 if self._begun_s is None else now_s - self._begun_s
 
-    def is_over(self, now_s: float) -> bool:
-        return self.elapsed_s(now_s) > self.duration_s
-
     def _schedule(self, speed: float) -> None:
         now_s, rolled = STILL_S, np.zeros(2)
         for i, scan in enumerate(self.recording.scans):
