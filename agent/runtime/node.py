@@ -178,6 +178,7 @@ def mapping_options(config: Config) -> MappingOptions:
     return MappingOptions(
         resolution_m=mapping.resolution_m,
         particles=mapping.particles,
+        max_speed_m_s=config.wheels.max_speed_mps,
         T_base_laser=SE2(lidar.mount_x_m, lidar.mount_y_m, math.radians(lidar.mount_yaw_deg)),
         **more,
     )
