@@ -38,15 +38,22 @@ class ChildError(Exception):
 
 
 class AgentProcess:
-    """One `mapquilt run` as a child."""
+    """One `mapquilt run` (or another command that speaks the same) as a child."""
 
-    def __init__(self, robot: str, arguments: Sequence[str], folder: Path, environment: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self,
+        robot: str,
+        arguments: Sequence[str],
+        folder: Path,
+        environment: Mapping[str, str] | None = None,
+        command: str = "run",
+    ) -> None:
         self.robot = robot
         self.log_path = folder / f"{robot}.log"
         self._log = self.log_path.open("ab")
-        command = [sys.executable, "-m", "agent", "run", "--id", robot, *arguments]
+        words = [sys.executable, "-m", "agent", command, "--id", robot, *arguments]
         self.process = subprocess.Popen(
-            [*command, "--ready-json", "--die-with-parent", str(os.getpid())],
+            [*words, "--ready-json", "--die-with-parent", str(os.getpid())],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=self._log,

@@ -39,7 +39,6 @@ EXAMPLES = """\
 """
 
 DURATION_S = 40.0  # exploring goes on this long although the maps may fit sooner: a person sees the map grow
-MERGE_WITHIN_S = 50.0  # the whole command stays below a minute
 LOOK_EVERY_S = 0.5
 
 
@@ -47,8 +46,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robots", type=int, default=3, metavar="N", help="how many (default: 3; a recording is cut for 2)")
     parser.add_argument("--world", default="office", help="office, outdoor, random, a world file, or log:FILE.clf[.gz]")
     parser.add_argument("--seed", type=int, default=0, help="another building, other starts, other noise")
-    parser.add_argument("--duration", type=float, default=DURATION_S, metavar="S", help=f"seconds of exploring (default: {DURATION_S:.0f})")
-    parser.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR", help="where pictures and figures go (default: out/demo)")
+    parser.add_argument(
+        "--duration", type=float, default=DURATION_S, metavar="S", help=f"seconds of exploring (default: {DURATION_S:.0f})"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("out/demo"), metavar="DIR", help="where pictures and figures go (default: out/demo)"
+    )
     parser.add_argument("--no-serve", action="store_true", help="end when done, instead of showing the page until Ctrl-C")
     parser.add_argument("--json", action="store_true", help="the figures as one JSON object on stdout")
 
@@ -62,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="mq-")))  # short: sockets have short names
         try:
-            stage = stack.enter_context(open_stage(args.world, args.robots, args.seed, args.duration, folder))
+            stage = stack.enter_context(open_stage(args.world, args.robots, args.seed, folder))
         except DeviceConfigError as error:
             raise CommandError(str(error), USAGE) from error
         fleet = Fleet(stack, stage, folder)
@@ -145,7 +148,7 @@ class Show:
             self.progress(elapsed_s)
             if elapsed_s >= self.args.duration and (self.merged_after_s is not None or len(self.fleet.agents) == 1):
                 return
-            if elapsed_s >= max(self.args.duration, MERGE_WITHIN_S) or self.fleet.stage.is_over():
+            if elapsed_s >= max(self.args.duration, self.fleet.stage.time_limit_s()):
                 return
 
     def progress(self, elapsed_s: float) -> None:
@@ -156,7 +159,8 @@ class Show:
         factors = [p["match_factor"] for s in self.statuses for p in s["peers"] if p["match_factor"]]
         groups = max((len(s["group"]) for s in self.statuses), default=0)
         state = f"{groups} of {len(self.statuses)} in one map" if groups else "not merged yet"
-        line = f"{elapsed_s:5.1f} s  {scans} scans  {known:.0f} m2  {links} peers  best match {max(factors, default=0.0):.3f}  {state}"
+        best = f"best match {max(factors):.3f}" if factors else "no match"
+        line = f"{elapsed_s:5.1f} s  {scans} scans  {known:.0f} m2  {links} peers  {best}  {state}"
         if self.args.quiet:
             return
         if sys.stderr.isatty():
@@ -241,5 +245,3 @@ class Show:
 def hold_one_map(statuses: Sequence[dict[str, Any]], robots: int) -> bool:
     """Every robot is in one group and holds a global map of all of them."""
     return robots > 1 and len(statuses) == robots and all(s["global"] and len(s["global"]["members"]) == robots for s in statuses)
-
-

@@ -74,7 +74,7 @@ def aligned(fused: OccupancyGrid, truth: OccupancyGrid, T_world_global: SE2) -> 
 def distance_to_wall_m(truth: OccupancyGrid) -> NDArray[np.float32]:
     """(H, W) metres from each cell to the nearest wall cell, cut at 0.5 m so that stray cells do not steer."""
     field_px = cv2.distanceTransform((truth.cells != OCCUPIED).astype(np.uint8), cv2.DIST_L2, 5)
-    return np.minimum(field_px * truth.resolution_m, 0.5).astype(np.float32)
+    return np.asarray(np.minimum(field_px * truth.resolution_m, 0.5), np.float32)
 
 
 def cost(walls_m: NDArray[np.float64], T_world_global: SE2, truth: OccupancyGrid, distance_m: NDArray[np.float32]) -> float:

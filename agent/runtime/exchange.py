@@ -102,9 +102,21 @@ class Exchange:
         self.close()
 
     def open(self) -> None:
-        """Open the session; `ZError` from Zenoh becomes one `ExchangeError` that says what to try."""
-        self._open_session(self.settings.connect)
+        """Open the session; `ZError` from Zenoh becomes one `ExchangeError` that says what to try.
+
+        A client whose router is away maps on its own until `reopen` finds it: see `is_open`.
+        """
+        try:
+            self._open_session(self.settings.connect)
+        except ExchangeError as error:
+            if self.settings.mode != "client":
+                raise
+            log.warning("%s Trying again until it does.", error)
         self._answering.start()
+
+    @property
+    def is_open(self) -> bool:
+        return self._session is not None
 
     def close(self) -> None:
         """Leave the network.  Never raises, never waits more than Zenoh's own 10 s."""
@@ -123,8 +135,8 @@ class Exchange:
             self._close_session()
             try:
                 self._open_session(connect)
-            except ExchangeError:
-                log.warning("network: could not open again, next try later", exc_info=True)
+            except ExchangeError as error:
+                log.debug("%s", error)
 
     def _open_session(self, connect: tuple[str, ...]) -> None:
         config = zenoh_config(self.settings)

@@ -56,6 +56,7 @@ class FleetWorker:
         )
         self.local_maps: Latest[tuple[LocalMap, FeatureMap]] = Latest()
         self.poses: Latest[SE2] = Latest()
+        self.garbage = 0  # messages that no robot of ours sends
         self.global_map: GlobalMap | None = None
         self.peer_maps: dict[str, tuple[bytes, OccupancyGrid]] = {}  # replaced, never changed, by this worker only
         self._coordinator, self._merger, self._on_note = coordinator, merger, on_note
@@ -118,10 +119,17 @@ class FleetWorker:
             if message.robot != robot or push_register(message) != register:
                 raise RemoteProtocolError(f"a message of {message.robot} on {register} of {robot}")
         except (RemoteProtocolError, LocalProtocolError) as error:
-            reason = str(error)
-            self._do(lambda now_s: self._coordinator.on_garbage(robot, reason, now_s))
+            self._on_garbage(robot, str(error))
             return
         self._do(lambda now_s: self._coordinator.on_message(message, now_s))
+
+    def _on_garbage(self, robot: str, reason: str) -> None:
+        """Only a certificate proves who wrote on a key: without one, garbage must not speak against the robot it names."""
+        self.garbage += 1
+        if self.settings.security == "mtls":
+            self._do(lambda now_s: self._coordinator.on_garbage(robot, reason, now_s))
+        if str(self.garbage).strip("0") == "1":  # the 1st, 10th, 100th, ...: a flood does not fill the log
+            log.warning("garbage key=%s messages=%d reason=%s", robot, self.garbage, reason)
 
     def _on_result(self, result: Done | tuple[Fetch, Message | None]) -> None:
         if isinstance(result, tuple):

@@ -31,6 +31,7 @@ STEP_S = 0.5
 REOPEN_AFTER_S = 20.0  # stalls of 10 s are normal and mean nothing
 REOPEN_AT_MOST_EVERY_S = 300.0
 CHECKPOINT_WITHIN_S = 1.0
+OPEN_EVERY_S = 2.0  # a client looks for its router this often
 
 
 class Keeper:
@@ -43,6 +44,7 @@ class Keeper:
         self._wait = threading.Event()
         self._silent_since_s: float | None = None
         self._reopen_after_s = REOPEN_AFTER_S
+        self._next_open_s = 0.0
         self._seeds = tuple(node.config.fleet.connect)
         self.locators: list[str] = []
         self.links: list[str] = []
@@ -50,7 +52,7 @@ class Keeper:
     def step(self) -> None:
         self._wait.wait(STEP_S)
         node = self._node
-        if not self.locators:
+        if not self.locators and node.fleet.exchange.is_open:
             self.locators = node.fleet.exchange.locators()
         self.links = node.fleet.exchange.links()
         self._watch_links()
@@ -73,6 +75,11 @@ class Keeper:
     def _watch_links(self) -> None:
         """Open the session anew when every robot we know has been silent for long, or nobody is linked at all."""
         node, now = self._node, time.monotonic()
+        if not node.fleet.exchange.is_open:
+            if now >= self._next_open_s:
+                self._next_open_s = now + OPEN_EVERY_S
+                node.fleet.exchange.reopen(self._seeds)
+            return
         peers = node.fleet.state().peers
         is_alone = (
             bool(peers or self._seeds)

@@ -187,6 +187,7 @@ def network(node: Node) -> dict[str, Any]:
         **{name: getattr(exchange.traffic, name) for name in exchange.traffic.__slots__},
         "inbox_replaced": exchange.inbox.replaced,
         "inbox_dropped": exchange.inbox.dropped,
+        "garbage": node.fleet.garbage,
     }
 
 
@@ -195,6 +196,8 @@ def problems(node: Node, fleet: FleetState) -> list[str]:
     said = [
         d["error"] or f"{d['name']} {d['url']}: {d['state']}" for d in devices(node) if d["state"] != DeviceState.RUNNING.value
     ]
+    if not node.fleet.exchange.is_open:
+        said.append(f"no network: no router answers at {', '.join(node.config.fleet.connect)}; this robot maps on its own")
     if fleet.is_twin:
         said.append(f"another robot calls itself {node.robot}: this one, the younger, stays silent; give it another --id")
     if node.map.is_paused:

@@ -21,6 +21,7 @@ from typing import Any
 from agent.commands.children import AgentProcess, stop_all
 from agent.commands.demo_stage import Actor, Stage, open_stage
 from agent.runtime.control import ControlError
+from tests.harness.network import Network
 
 LOOK_EVERY_S = 0.2
 _numbers = itertools.count()
@@ -47,7 +48,7 @@ class Fleet:
         """Simulated robots in one world, on ptys."""
         folder = self.folder / f"{prefix}-devices"
         folder.mkdir()
-        return self._stack.enter_context(open_stage(world, robots, seed, 60.0, folder, prefix))
+        return self._stack.enter_context(open_stage(world, robots, seed, folder, prefix))
 
     def start(self, actor: Actor, *, connect: Sequence[str] | None = None, arguments: Sequence[str] = ()) -> AgentProcess:
         """A robot's process on an actor's devices, up and ready; by default it dials the first robot that was started."""
@@ -63,6 +64,18 @@ class Fleet:
         assert previous is None or not previous.is_running
         agent.wait_ready()
         return agent
+
+    def router(self, name: str = "router", connect: Sequence[str] = ()) -> str:
+        """A router's process; its locator."""
+        connections = [part for locator in connect for part in ("--connect", locator)]
+        arguments = ["--fleet", self.name, "--listen", "tcp/127.0.0.1:0", *connections]
+        router = AgentProcess(name, arguments, self.folder, command="router")
+        self._stack.callback(router.stop)
+        return str(router.wait_ready()["locators"][0])
+
+    def network(self) -> Network:
+        """Cables that can be cut."""
+        return self._stack.enter_context(Network())
 
     def status(self, robot: str) -> dict[str, Any]:
         """What a robot says of itself; empty while it cannot answer."""
