@@ -1,0 +1,72 @@
+"""A recording of somebody's robot as readings, whatever it was written with: a CARMEN log, or a rosbag2 / MCAP file.
+
+recording = open_recording("intel.log.gz")
+for reading in recording.readings: ...          # Odometry before the scan it belongs to, stamps strictly growing
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from hw.carmen import RecordedScan, read_recording
+from hw.errors import DeviceConfigError
+from hw.readings import LaserScan, Odometry
+from protocol.geometry import SE2
+
+LONGEST_STEP_S = 1e-6  # stamps that repeat or go back follow the one before by this
+
+
+class RecordingError(Exception):
+    """A recording that cannot be read: says which, what was seen, and what to try."""
+
+
+@dataclass(frozen=True, slots=True)
+class Readings:
+    """What a recording holds; `first_stamp_s` is the wall clock at stamp 0 when the recording says."""
+
+    name: str
+    readings: Sequence[LaserScan | Odometry]
+    first_stamp_s: float = 0.0
+    T_base_laser: SE2 | None = None  # where the LIDAR sat, when the recording says
+
+    @property
+    def scans(self) -> int:
+        return sum(isinstance(reading, LaserScan) for reading in self.readings)
+
+
+def open_recording(path: Path, scan_topic: str | None = None, odometry_topic: str | None = None) -> Readings:
+    """By what the file is; RecordingError when it is none of those."""
+    if path.is_dir() or path.suffix in (".mcap", ".db3", ".bag"):
+        from agent.rosbags_reader import read_bag  # noqa: PLC0415  an optional package
+
+        return in_order(read_bag(path, scan_topic, odometry_topic))
+    try:
+        recording = read_recording(path)
+    except DeviceConfigError as error:
+        raise RecordingError(str(error)) from error
+    return in_order(Readings(recording.name, list(carmen_readings(recording.scans))))
+
+
+def carmen_readings(scans: Iterable[RecordedScan]) -> Iterator[LaserScan | Odometry]:
+    """Motions from scan to scan, chained to the odometry a robot would have had; an unknown one is a discontinuity."""
+    T_odom_base = SE2.identity()
+    for scan in scans:
+        if scan.motion is not None:
+            T_odom_base = T_odom_base @ scan.motion
+        yield Odometry(scan.stamp_s, T_odom_base.x_m, T_odom_base.y_m, T_odom_base.theta_rad, scan.motion is None)
+        yield scan.laser_scan()
+
+
+def in_order(recording: Readings) -> Readings:
+    """With stamps that grow: some loggers wrote out of order, some repeat a stamp."""
+    ordered: list[LaserScan | Odometry] = []
+    last_s = float("-inf")
+    for reading in recording.readings:
+        stamp_s = (
+            max(reading.stamp_s, last_s) if isinstance(reading, LaserScan) else max(reading.stamp_s, last_s + LONGEST_STEP_S)
+        )
+        ordered.append(reading if stamp_s == reading.stamp_s else replace(reading, stamp_s=stamp_s))
+        last_s = stamp_s
+    return replace(recording, readings=ordered)
