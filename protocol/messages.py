@@ -72,7 +72,7 @@ class Beat:
     period_s: float  # the next beat is due after this; silence is counted in these
     map: MapVersion | None  # None: no map yet
     edges_digest: bytes  # 8 bytes over all its statements
-    global_digest: bytes  # of the global map it holds; NO_DIGEST: none
+    global_digest: bytes  # `recipe_id` of the global map it holds; NO_DIGEST: none
     T_map_robot: SE2 | None = None
     is_frozen: bool = False
     load: float = 0.0  # share of its work time that is used, 0 to 1
@@ -197,6 +197,17 @@ class GlobalMember:
     covariance: Symmetric3
 
 
+def recipe_id(root: str, members: tuple[GlobalMember, ...], digest: bytes) -> bytes:
+    """16 bytes that name a global map: which maps, where, and what came out."""
+    hashed = hashlib.sha256(root.encode() + digest)
+    for member in members:
+        T = member.T_global_map
+        hashed.update(member.robot.encode() + member.map.digest)
+        hashed.update(struct.pack("<Q3d", member.map.frame, T.x_m + 0.0, T.y_m + 0.0, T.theta_rad + 0.0))
+        hashed.update(struct.pack("<6d", *member.covariance))
+    return hashed.digest()[:16]
+
+
 @dataclass(frozen=True, slots=True)
 class GlobalMeta:
     """The global map as a recipe: lay exactly these maps at exactly these transforms and fuse; the result has `digest`.
@@ -217,6 +228,9 @@ class GlobalMeta:
 
     def member(self, robot: str) -> GlobalMember | None:
         return next((member for member in self.members if member.robot == robot), None)
+
+    def id(self) -> bytes:
+        return recipe_id(self.root, self.members, self.digest)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -266,6 +280,9 @@ class GlobalMap:
     conflicting_cells: int = 0
     agreeing_cells: int = 0
     T_global_robot: Mapping[str, SE2] = field(default_factory=dict)  # poses, as far as known
+
+    def id(self) -> bytes:
+        return recipe_id(self.root, self.members, self.digest)
 
 
 Message = (

@@ -24,6 +24,7 @@ from protocol.tiles import TileMap
 
 _KEPT_GLOBAL_MAPS = 6
 _FOLLOW_M, _FOLLOW_RAD = 0.4, 0.06  # how far a composer's layout may be from ours and still be followed
+_RECIPE_WAIT_S = 2.5
 _PATIENCE_S = 10.0  # without a usable recipe for this long, each makes its own
 
 MissingMap = tuple[str, bytes]  # (robot, digest) that a recipe needs
@@ -62,6 +63,7 @@ class Composition:
         self._made: _Recipe | None = None  # what `global_map` was made from
         self._running: tuple[int, _Recipe, float] | None = None
         self._composed_s = -1e9
+        self._grouped_s: float | None = None  # since when we are not alone
         self._followed_s: float | None = None  # since when there was a usable recipe, or we began to wait for one
         self._seq = 0
 
@@ -125,11 +127,28 @@ class Composition:
         return self._ledger.options.is_frozen if robot == self._ledger.robot else self._ledger.peers[robot].is_frozen
 
     def _root_of(self, group: Group) -> str:
-        """Whose frame is the global one: a given map's, else the one it was, else the smallest robot's."""
+        """Whose frame is the global one: a given map's, else the one it was, else the smallest robot's.
+
+        When groups meet, the frame of the larger one stays: fewer robots see their map jump.
+        """
         frozen = [robot for robot in group.T_root if self._is_frozen(robot)]
         if frozen:
             return self.root if self.root in frozen else min(frozen)
-        return self.root if self.root in group.T_root and self.global_map is not None else min(group.T_root)
+        known = [(len(meta.members), meta.root) for meta in self._metas_of(group) if meta.root in group.T_root]
+        largest, root = max(known, key=lambda pair: pair[0], default=(0, min(group.T_root)))
+        if self.global_map is not None and self.root in group.T_root and largest <= len(self.global_map.members):
+            return self.root
+        return root
+
+    def _metas_of(self, group: Group) -> list[GlobalMeta]:
+        """Recipes that members of the group published and still hold."""
+        peers = [self._ledger.peers[robot] for robot in sorted(group.T_root) if robot in self._ledger.peers]
+        return [p.meta for p in peers if p.meta is not None and p.beat is not None and p.beat.global_digest == p.meta.id()]
+
+    def awaits_meta(self, robot: str) -> bool:
+        """Whether a peer of our group holds a global map whose frame we should know before we make our own."""
+        group = self._ledger.group
+        return self.global_map is None and group is not None and robot in group.T_root
 
     # Composing.
 
@@ -142,12 +161,24 @@ class Composition:
                 versions[robot] = peer.admitted
                 if peer.map is not None and peer.map != peer.held:
                     missing.append((robot, b""))
+        if self._waits_for_recipes(group, now_s):
+            return missing
         if now_s - self._composed_s >= self._ledger.options.compose_period_s:
             recipe = self._recipe(group, {robot: version for robot, version in versions.items() if version is not None})
             if recipe is not None and recipe != self._made:
                 self._composed_s = now_s
                 self._fuse(recipe, now_s)
         return missing
+
+    def _waits_for_recipes(self, group: Group, now_s: float) -> bool:
+        """A newcomer first asks which frame the others share already; not for long."""
+        if self.global_map is not None:
+            return False
+        if self._grouped_s is None:
+            self._grouped_s = now_s
+        peers = [self._ledger.peers[robot] for robot in group.T_root if robot in self._ledger.peers]
+        is_told = all(p.meta is not None or p.beat is None or not p.beat.global_digest for p in peers)
+        return not is_told and now_s - self._grouped_s < _RECIPE_WAIT_S
 
     def _recipe(self, group: Group, versions: dict[str, MapVersion]) -> _Recipe | None:
         """The group's layout with these versions; None while there are fewer than two whose cells are here."""
@@ -249,7 +280,7 @@ class Composition:
 
     def _be_alone(self) -> None:
         self.composer = self.root = self._ledger.robot
-        self._followed_s = self._made = self._running = self.meta = None
+        self._followed_s = self._grouped_s = self._made = self._running = self.meta = None
         if self.global_map is not None:
             self.global_map = None
             self.history = History(_KEPT_GLOBAL_MAPS)

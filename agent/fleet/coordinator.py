@@ -477,7 +477,7 @@ class Coordinator:
                 period_s,
                 self._ledger.own.version,
                 statements_digest(self._ledger.mine.values()),
-                held.digest if held else NO_DIGEST,
+                held.id() if held else NO_DIGEST,
                 self._T_map_robot,
                 self.options.is_frozen,
             )
@@ -524,8 +524,9 @@ class Coordinator:
             self._fetching.want(peer.robot, "feat", "map/feat", now_s)
         if peer.beat_s >= peer.said_s and beat.edges_digest != statements_digest(peer.statements.values()):
             self._fetching.want(peer.robot, "edges", "edges", now_s)
-        meta_digest = peer.meta.digest if peer.meta else NO_DIGEST
-        if peer.robot == self._composition.composer and beat.global_digest != meta_digest:
+        meta_id = peer.meta.id() if peer.meta else NO_DIGEST
+        is_wanted = peer.robot == self._composition.composer or self._composition.awaits_meta(peer.robot)
+        if is_wanted and beat.global_digest not in (NO_DIGEST, meta_id):
             self._fetching.want(peer.robot, "global", "global/meta", now_s)
 
     def _pull_maps(self, turn: list[Peer], now_s: float) -> None:

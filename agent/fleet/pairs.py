@@ -217,11 +217,13 @@ class PairWork:
     def _is_recheck_due(self, pair: Pair, peer: Peer, now_s: float) -> bool:
         own = self._ledger.own.version
         assert own is not None
+        options = self._ledger.options
+        if pair.failures > 0 and pair.checked is not None:  # once more, to be sure
+            return now_s - pair.checked.at_s >= options.reverify_period_s
         if peer.held is None or (own.digest, peer.held.digest) == pair.checked_digests:
             return False
         if pair.is_urgent or pair.checked is None:
             return True
-        options = self._ledger.options
         has_grown = self._area_m2(peer) >= pair.checked.area_m2 * (1.0 + options.reverify_growth)
         return has_grown and now_s - pair.checked.at_s >= options.reverify_period_s
 
@@ -403,15 +405,19 @@ class PairWork:
                 self.withdraw(peer.robot, f"{peer.robot}: {said.reason or said.stance.value}", now_s)
 
     def drop_void(self, robot: str) -> None:
-        """Forget statements about frames that are drawn no more; remember where the peer was, in case it is there still."""
-        for other in [robot] if robot != self._ledger.robot else list(self._ledger.mine):
-            mine = self._ledger.mine.get(other)
-            if mine is None or self._ledger.frame_of(other) is None or self._ledger.is_current(mine.evidence):
+        """Forget everything about frames that are drawn no more; remember where the peer was, in case it is there still."""
+        others = [robot] if robot != self._ledger.robot else sorted(self.pairs)
+        for other in others:
+            if self._ledger.frame_of(other) is None:
                 continue
-            boot = self.pair(other).boot
-            pair = self.pairs[other] = Pair(other, attempts=self.pair(other).attempts)
-            is_same_life = other not in self._ledger.peers or self._ledger.peers[other].boot == boot
-            if mine.stance in (Stance.PROPOSE, Stance.ACK) and is_same_life:
+            mine, old = self._ledger.mine.get(other), self.pair(other)
+            if mine is not None and self._ledger.is_current(mine.evidence):
+                continue
+            pair = self.pairs[other] = Pair(other, attempts=old.attempts)
+            if mine is None:
+                continue
+            peer = self._ledger.peers.get(other)
+            if mine.stance in (Stance.PROPOSE, Stance.ACK) and peer is not None and peer.boot == old.boot:
                 pair.hint = self._from_our_side(mine.evidence)
             del self._ledger.mine[other]
             self._ledger.seq += 1
