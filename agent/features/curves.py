@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from protocol.features import CURVE_COLUMNS
 
 RADII_M = (0.6, 1.2, 2.4)
-SPACING_M = 0.2  # one point stands for this much wall
 MIN_FILL = 0.5  # wall in a piece, in radii: less is a splinter
 MAX_POINTS = 2000
 MAX_STARTS = 250
@@ -23,18 +22,17 @@ MAX_PER_RADIUS = 24
 _SHIFTS = 3  # mean-shift steps; most settle in two
 
 
-def curve_table(points_m: NDArray[np.float64], normals: NDArray[np.float64]) -> NDArray[np.float32]:
-    """(N, 5) `CURVE_COLUMNS` of (N, 2) wall points, one every `SPACING_M`, whose normals point to the free side."""
-    if len(points_m) > MAX_POINTS:
-        keep = np.linspace(0, len(points_m) - 1, MAX_POINTS).astype(np.int64)
-        points_m, normals = points_m[keep], normals[keep]
+def curve_table(points_m: NDArray[np.float64], normals: NDArray[np.float64], spacing_m: float) -> NDArray[np.float32]:
+    """(N, 5) `CURVE_COLUMNS` of (N, 2) wall points, each standing for `spacing_m`, whose normals point to the free side."""
     if not len(points_m):
         return np.zeros((0, len(CURVE_COLUMNS)), np.float32)
-    rows = [row for radius_m in RADII_M for row in _pieces(points_m, normals, radius_m)]
+    stride = -(-len(points_m) // MAX_POINTS)
+    points_m, normals, spacing_m = points_m[::stride], normals[::stride], spacing_m * stride
+    rows = [row for radius_m in RADII_M for row in _pieces(points_m, normals, radius_m, spacing_m)]
     return np.array(rows, np.float32).reshape(-1, len(CURVE_COLUMNS))
 
 
-def _pieces(points: NDArray[np.float64], normals: NDArray[np.float64], radius_m: float) -> list[list[float]]:
+def _pieces(points: NDArray[np.float64], normals: NDArray[np.float64], radius_m: float, spacing_m: float) -> list[list[float]]:
     """Disjoint pieces of one radius, the fullest first."""
     centres = _settled(points, radius_m)
     members = _within(points, centres, radius_m)
@@ -45,10 +43,10 @@ def _pieces(points: NDArray[np.float64], normals: NDArray[np.float64], radius_m:
         if len(rows) == MAX_PER_RADIUS:
             break
         mine = members[i]
-        if mine.sum() * SPACING_M < MIN_FILL * radius_m or not free[mine].all():
+        if mine.sum() * spacing_m < MIN_FILL * radius_m or not free[mine].all():
             continue
         free[mine] = False
-        rows.append(_described(points[mine], normals[mine]))
+        rows.append(_described(points[mine], normals[mine], spacing_m))
     return rows
 
 
@@ -73,7 +71,7 @@ def _within(points: NDArray[np.float64], centres: NDArray[np.float64], radius_m:
     return near
 
 
-def _described(points: NDArray[np.float64], normals: NDArray[np.float64]) -> list[float]:
+def _described(points: NDArray[np.float64], normals: NDArray[np.float64], spacing_m: float) -> list[float]:
     """Centre of mass, normal of the regression line towards the free side, length of wall, uncertainty of the centre."""
     centre = points.mean(axis=0)
     away = points - centre
@@ -84,4 +82,4 @@ def _described(points: NDArray[np.float64], normals: NDArray[np.float64]) -> lis
         normal_rad += math.pi
     spread = math.sqrt(max(xx + yy, 0.0) / 2)
     sigma = math.hypot(0.03, spread / max(len(points), 1))  # a point more or less at the rim shifts the mean by this
-    return [float(centre[0]), float(centre[1]), math.remainder(normal_rad, math.tau), len(points) * SPACING_M, sigma]
+    return [float(centre[0]), float(centre[1]), math.remainder(normal_rad, math.tau), len(points) * spacing_m, sigma]

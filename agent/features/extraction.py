@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.features.curves import SPACING_M, curve_table
+from agent.features.curves import curve_table
 from agent.features.lines import WallLines, wall_lines
 from agent.features.round_walls import Arc, as_tables, find_arcs
 from agent.features.wall_points import WallPoints, wall_points
@@ -24,6 +24,8 @@ from protocol.geometry import SE2
 from protocol.grid import OccupancyGrid
 
 MIN_PIECE_M = 0.6  # less connected wall than this is a leg of a chair
+LINE_WIDTH_M = 0.3  # wall this wide around a line is the line's: both surfaces, and their noise
+CORNER_M = 0.2
 MAX_CHORD_M = 2.5  # a shorter line may be a chord of something round: arcs get to see its cells too
 MAX_TAKEN = 0.6  # a line more of which lies on arcs was one
 
@@ -51,9 +53,8 @@ def feature_map(working: WorkingGrid, walls: WallPoints, lines: WallLines, T_map
     on_arc[loose] = _explained(arcs, cells_m[loose], working.resolution_m)
     kept = _straight_lines(lines, arcs, working.resolution_m)
     rest = loose[~on_arc[loose] & ~np.append(kept, False)[line_of[loose]]]
-    rest = rest[_thinned(cells_m[rest])]
     circles, round_pieces = as_tables(arcs)
-    curves = curve_table(cells_m[rest], walls.normals[rest].astype(np.float64))
+    curves = curve_table(cells_m[rest], walls.normals[rest].astype(np.float64), working.resolution_m)
     return FeatureMap(
         lines.table(T_map_grid)[kept],
         _moved(circles, T_map_grid, turned=()),
@@ -63,16 +64,19 @@ def feature_map(working: WorkingGrid, walls: WallPoints, lines: WallLines, T_map
 
 
 def _line_of_points(working: WorkingGrid, walls: WallPoints, lines: WallLines) -> NDArray[np.int64]:
-    """(N,) the longest line through each wall point's cell, -1 for none: the lines are painted, the short ones first."""
+    """(N,) the longest line through each wall point's cell, -1 for none: the lines are painted, the short ones first.
+
+    They are painted a little beyond their ends, where corners are too round for a line and too small for anything else.
+    """
     canvas = np.full(working.occupied.shape, -1, np.int32)
-    tangents = np.stack([-lines.normals[:, 1], lines.normals[:, 0]], axis=1) * lines.lengths_m[:, None] / 2
+    half_m = (lines.lengths_m / 2 + CORNER_M)[:, None]
+    tangents = np.stack([-lines.normals[:, 1], lines.normals[:, 0]], axis=1) * half_m
     ends = np.stack([lines.middles_m - tangents, lines.middles_m + tangents], axis=1) / working.resolution_m - 0.5
-    thickness = max(1, round(0.3 / working.resolution_m))
+    thickness = max(1, round(LINE_WIDTH_M / working.resolution_m))
     for i in range(len(lines) - 1, -1, -1):
         (x0, y0), (x1, y1) = np.rint(ends[i]).astype(int).tolist()
         cv2.line(canvas, (x0, y0), (x1, y1), i, thickness)
-    line_of = canvas[walls.cells_rc[:, 0], walls.cells_rc[:, 1]].astype(np.int64)
-    return np.where(lines.support_m > 0, line_of, -1)
+    return canvas[walls.cells_rc[:, 0], walls.cells_rc[:, 1]].astype(np.int64)
 
 
 def _is_sizeable(working: WorkingGrid, cells_rc: NDArray[np.int32]) -> NDArray[np.bool_]:
@@ -108,13 +112,6 @@ def _straight_lines(lines: WallLines, arcs: list[Arc], resolution_m: float) -> N
     on_arc = _explained(arcs, points.reshape(-1, 2), resolution_m).reshape(-1, 10)
     straight: NDArray[np.bool_] = (on_arc.mean(axis=1) <= MAX_TAKEN) | (lines.lengths_m >= MAX_CHORD_M)
     return straight
-
-
-def _thinned(points_m: NDArray[np.float64]) -> NDArray[np.int64]:
-    """One point of every square of `SPACING_M`."""
-    square = np.floor(points_m / SPACING_M).astype(np.int64)
-    _, first = np.unique((square[:, 0] << 32) + square[:, 1], return_index=True)
-    return np.sort(first)
 
 
 def _moved(table: FeatureTable, T_map_grid: SE2, turned: tuple[int, ...]) -> FeatureTable:
