@@ -1,0 +1,100 @@
+"""Revolutions are cut where the head passes zero, and doubtful beams say nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hw.clock import DeviceClock
+from hw.scan_assembler import Beams, ScanAssembler, coverage_of, is_evenly_spaced, supported_only
+
+
+def _beams(turns: np.ndarray, begin_s: float = 0.0, dirty: bool = False) -> Beams:
+    turn_deg = turns % 360.0
+    stamps_s = begin_s + (turns - turns[0]) / 3600.0
+    return Beams(turn_deg, -np.radians(turn_deg), np.full(len(turns), 2.0), stamps_s, None, np.full(len(turns), dirty))
+
+
+def test_scans_are_cut_at_the_turn_and_the_unfinished_ends_are_not_handed_on() -> None:
+    scans = ScanAssembler(0.1, 10.0).add(_beams(np.arange(100.0, 1900.0)))
+    assert [len(scan.ranges_m) for scan in scans] == [360, 360, 360, 360]
+    assert not any(scan.is_partial for scan in scans)
+    assert scans[0].angles_rad[1] < 0, "clockwise turns become counter-clockwise angles"
+
+
+def test_a_tenth_of_a_turn_missing_is_partial() -> None:
+    turns = np.concatenate([np.arange(0.0, 800.0), np.arange(836.0, 1500.0)])
+    assert [scan.is_partial for scan in ScanAssembler(0.1, 10.0).add(_beams(turns))] == [False, True, False]
+
+
+def test_after_half_a_turn_missing_the_next_cut_is_waited_for() -> None:
+    turns = np.concatenate([np.arange(0.0, 760.0), np.arange(1000.0, 2200.0)])
+    scans = ScanAssembler(0.1, 10.0).add(_beams(turns))
+    stamps = [round(scan.stamp_s * 3600) for scan in scans]
+    assert stamps == [360, 1080, 1440, 1800]
+
+
+def test_ranges_outside_the_limits_are_invalid_and_infinity_stays() -> None:
+    beams = _beams(np.arange(0.0, 1100.0))
+    beams.ranges_m[360:364] = [0.05, 11.0, np.inf, np.nan]
+    scan = ScanAssembler(0.1, 10.0).add(beams)[0]
+    assert np.isnan(scan.ranges_m[[0, 1, 3]]).all() and np.isinf(scan.ranges_m[2])
+
+
+def test_on_a_dirty_line_a_lone_beam_says_nothing() -> None:
+    for dirty in (False, True):
+        beams = _beams(np.arange(0.0, 1100.0), dirty=dirty)
+        beams.ranges_m[500] = 2.3
+        scan = ScanAssembler(0.1, 10.0).add(beams)[0]
+        assert np.isnan(scan.ranges_m[140]) == dirty
+
+
+def test_a_slanting_wall_supports_its_beams_and_an_edge_does_not() -> None:
+    wall = 2.0 + 0.02 * np.arange(50.0)
+    assert np.isfinite(supported_only(wall)[1:-1]).all()
+    edge = np.where(np.arange(50) < 25, 2.0, 4.0)
+    assert np.flatnonzero(np.isnan(supported_only(edge)[1:-1])).tolist() == [23, 24]
+    shifted = wall.copy()
+    shifted[20:23] += 0.5
+    assert np.isnan(supported_only(shifted, (1, 3))[20:23]).all()
+
+
+def test_an_angle_out_of_line_is_seen() -> None:
+    angles = -np.radians(np.arange(0.0, 360.0))
+    angles[100] += np.radians(2.0)
+    assert np.flatnonzero(~is_evenly_spaced(angles)).tolist() == [99, 100, 101]
+
+
+def test_coverage_counts_what_is_missing() -> None:
+    full = np.arange(0.0, 360.0, 0.8)
+    assert coverage_of(full) == 1.0
+    assert abs(coverage_of(full[(full < 90) | (full >= 180)]) - 0.75) < 0.01
+
+
+def test_a_stuck_head_does_not_fill_the_memory() -> None:
+    assembler = ScanAssembler(0.1, 10.0)
+    for k in range(100):
+        assembler.add(_beams(np.full(1000, 90.0), begin_s=k * 0.01))
+    assert assembler._pending_n <= 21000
+
+
+def test_the_clock_follows_the_earliest_arrivals_and_wraps() -> None:
+    clock = DeviceClock(30.0)
+    rng = np.random.default_rng(2)
+    worst_s = 0.0
+    for k in range(8000):
+        true_s = 0.1 * k
+        device_s = (true_s * (1 + 50e-6) + 27.0) % 30.0
+        arrival_s = 1000.0 + true_s + float(rng.exponential(0.004))
+        host_s = clock.to_host(device_s, arrival_s)
+        assert host_s <= arrival_s + 1e-9
+        if k > 100:
+            worst_s = max(worst_s, abs(host_s - (1000.0 + true_s)))
+    assert worst_s < 0.004
+
+
+def test_a_clock_that_begins_anew_is_followed() -> None:
+    clock = DeviceClock(30.0)
+    for k in range(100):
+        clock.to_host(10.0 + 0.1 * k, 500.0 + 0.1 * k)
+    assert clock.to_host(0.0, 510.0) == 510.0
+    assert abs(clock.to_host(0.1, 510.11) - 510.1) < 0.02
