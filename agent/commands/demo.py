@@ -43,7 +43,7 @@ LOOK_EVERY_S = 0.5
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--robots", type=int, default=3, metavar="N", help="how many (default: 3; a recording is cut for 2)")
+    parser.add_argument("--robots", type=int, default=0, metavar="N", help="how many (default: 3; a recording is cut for 2)")
     parser.add_argument("--world", default="office", help="office, outdoor, random, a world file, or log:FILE.clf[.gz]")
     parser.add_argument("--seed", type=int, default=0, help="another building, other starts, other noise")
     parser.add_argument(
@@ -57,6 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    args.robots = args.robots or (2 if args.world.startswith("log:") else 3)
     if not 1 <= args.robots <= 20:
         raise CommandError(f"--robots {args.robots}: choose 1 to 20", USAGE)
     interrupted = threading.Event()
@@ -143,10 +144,11 @@ class Show:
         while not interrupted.wait(LOOK_EVERY_S):
             self.statuses = self.fleet.statuses()
             elapsed_s = time.monotonic() - self.fleet.started_s
-            if self.merged_after_s is None and hold_one_map(self.statuses, len(self.fleet.agents)):
+            are_merged = hold_one_map(self.statuses, len(self.fleet.agents))
+            if are_merged and self.merged_after_s is None:
                 self.merged_after_s = elapsed_s
             self.progress(elapsed_s)
-            if elapsed_s >= self.args.duration and (self.merged_after_s is not None or len(self.fleet.agents) == 1):
+            if elapsed_s >= self.args.duration and (are_merged or len(self.fleet.agents) == 1):
                 return
             if elapsed_s >= max(self.args.duration, self.fleet.stage.time_limit_s()):
                 return
@@ -191,7 +193,7 @@ class Show:
         fused = self.fused(best["robot"]) if best is not None and best["group"] else None
         if best is None or fused is None:
             shutil.rmtree(out / "merged.png", ignore_errors=True)
-            return Figures(robots, [], None, [], 0.0, 0, None)
+            return Figures(robots, [], None, [], 0.0, 0, None, **self.scans())
         truth, T_world_global = self.fleet.stage.truth(), None
         if truth is not None:
             root = self.fleet.stage.start_pose(best["root"])
@@ -208,7 +210,12 @@ class Show:
             conflicting_cells=best["global"]["conflicting_cells"] if best["global"] else 0,
             agreement=agreement(fused, truth, T_world_global) if truth is not None and T_world_global is not None else None,
             pose_errors_m=self.pose_errors(T_world_global),
+            **self.scans(),
         )
+
+    def scans(self) -> dict[str, int]:
+        mappings = [s["mapping"] for s in self.statuses]
+        return {name: sum(m[name] for m in mappings) for name in ("scans", "scans_lost")}
 
     def fused(self, robot: str) -> OccupancyGrid | None:
         return next(agent for agent in self.fleet.agents if agent.robot == robot).grid()

@@ -29,6 +29,8 @@ class Figures:
     conflicting_cells: int
     agreement: float | None  # share of known cells that are as in the world; None: no truth (a recording)
     pose_errors_m: Mapping[str, float] = field(default_factory=dict)
+    scans: int = 0  # of all robots
+    scans_lost: int = 0  # came faster than a mapper could follow
 
     @property
     def are_all_merged(self) -> bool:
