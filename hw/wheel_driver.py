@@ -27,6 +27,7 @@ class WheelDriver(DriverBase):
         self._protocol = protocol
         self._integrator = TickIntegrator(protocol.geometry)
         self._clock: DeviceClock | None = None  # of a board that stamps its samples
+        self._last_stamp_s = 0.0
         self.bauds = protocol.baud_rates
         self.baud = self.bauds[0]
         self.identity.model = name
@@ -64,13 +65,15 @@ class WheelDriver(DriverBase):
             readings.append(self._integrator.add(sample, self._stamp_s(sample, now_s)))
         return readings
 
-    def _stamp_s(self, sample: TickSample, arrival_s: float) -> float:
-        """When the board counted, where it has a clock; else when its bytes came."""
-        if sample.clock_s is None:
-            return arrival_s
-        if self._clock is None or sample.is_reset:
-            self._clock = DeviceClock(sample.clock_period_s)
-        return self._clock.to_host(sample.clock_s, arrival_s)
+    def _stamp_s(self, sample: TickSample, now_s: float) -> float:
+        """When the sample was taken: by the board's own clock where it has one, else when it came; never before the last one."""
+        stamp_s = now_s
+        if sample.clock_s is not None and sample.clock_period_s > 0:
+            if self._clock is None or sample.is_reset:
+                self._clock = DeviceClock(sample.clock_period_s)
+            stamp_s = self._clock.to_host(sample.clock_s, now_s)
+        self._last_stamp_s = max(stamp_s, self._last_stamp_s)
+        return self._last_stamp_s
 
 
 def geometry_of(url: DeviceUrl) -> WheelGeometry | None:
