@@ -91,7 +91,7 @@ def turn_steps(points_m: NDArray[np.float32], reach_rad: float) -> NDArray[np.fl
     farthest_m = max(float(np.hypot(points_m[:, 0], points_m[:, 1]).max()), 2.0)
     step_rad = min(1.5 * COARSE_M / farthest_m, LARGEST_TURN_STEP_RAD)
     half = math.ceil(reach_rad / step_rad)
-    return np.arange(-half, half + 1) * step_rad
+    return np.arange(-half, half + 1, dtype=np.float64) * step_rad
 
 
 def coarse_points(points_m: NDArray[np.float32], voxel_m: float = COARSE_M) -> NDArray[np.float32]:

@@ -17,6 +17,8 @@ from hw.readings import LaserScan
 from protocol.geometry import SE2
 
 VOXEL_M = 0.05  # one point a voxel for matching: a near wall must not outvote the rest of the room
+ENOUGH_HITS = 80  # fewer than this within the matching range and the next ones are used too ...
+FAR = 2.4  # ... up to this many times as far: 60 m
 FACING_GAP_M = 0.4  # two neighbouring hits farther apart may be two things ...
 WIDEST_GAP_M = 1.0  # ... unless a third lies in line with them
 STRAIGHT = np.float32(0.985)  # cosine of 10 degrees
@@ -48,7 +50,8 @@ def scan_points(scan: LaserScan, track: OdometryTrack, options: MappingOptions) 
     """Every beam's end point, motion within the revolution undone."""
     ranges = np.asarray(scan.ranges_m, np.float64)
     is_return = np.isfinite(ranges) & (ranges >= max(scan.range_min_m, 1e-3)) & (ranges < scan.range_max_m)
-    cut = np.minimum(ranges[is_return], options.matching_range_m)
+    reach_m = matching_reach_m(ranges[is_return], options)
+    cut = np.minimum(ranges[is_return], reach_m)
     angles = np.asarray(scan.angles_rad, np.float64)[is_return]
     points_laser = np.stack([cut * np.cos(angles), cut * np.sin(angles)], axis=1)
     points = options.T_base_laser.apply(points_laser)
@@ -56,10 +59,18 @@ def scan_points(scan: LaserScan, track: OdometryTrack, options: MappingOptions) 
     reference = track.pose_at(stamp_s)
     if scan.duration_s > 0.0 and reference is not None and len(points):
         points = undo_motion(points, track.poses_at(beam_stamps_s(scan)[is_return]), reference)
-    is_hit = ranges[is_return] < options.matching_range_m
+    is_hit = ranges[is_return] < reach_m
     ends = points.astype(np.float32)
     hits = one_per_voxel(ends[is_hit])
     return ScanPoints(stamp_s, ends, is_hit, hits, one_per_voxel(np.vstack([hits, between(ends, is_hit, cut)])), scan.is_partial)
+
+
+def matching_reach_m(returns_m: NDArray[np.float64], options: MappingOptions) -> float:
+    """The matching range; on a wide place with little nearby, as much further as it takes to see enough."""
+    if len(returns_m) == 0 or np.count_nonzero(returns_m < options.matching_range_m) >= ENOUGH_HITS:
+        return options.matching_range_m
+    enough_m = float(np.sort(returns_m)[min(ENOUGH_HITS, len(returns_m)) - 1]) + 0.01
+    return min(max(enough_m, options.matching_range_m), FAR * options.matching_range_m)
 
 
 def between(ends_m: NDArray[np.float32], is_hit: NDArray[np.bool_], ranges_m: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 
 from agent.mapping.correlation import CoarseField
 from agent.mapping.likelihood import TiledFields
-from agent.mapping.scan_matching import Poses, information, refine, weakest_direction
+from agent.mapping.scan_matching import Poses, difference, information, refine, weakest_direction
 
 GOOD_FRACTION = 0.55  # mean field value of a match that needs no second look
 SMALL_STEP_M = 0.15  # below this, odometry lies in the basin of Gauss-Newton
 SMALL_STEP_RAD = math.radians(5)
 NEAR_REACH = (0.3, math.radians(12))  # search window after a large step
 WIDE_REACH = (0.8, math.radians(30))  # when the near window found nothing good
+LARGEST_OBJECTION = 15.0  # points of a scan, of which there are some hundred: wheels do slip
 STARTS = 4  # coarse peaks that Gauss-Newton is started from
 
 
@@ -29,6 +30,7 @@ class Tracked:
     """The pose that fits, and how well."""
 
     pose: NDArray[np.float64]  # (3,) T_map_robot
+    score: float  # how well it fits, less what odometry holds against it
     fraction: float  # mean field value under the scan, 0 to 1
     likelihood: NDArray[np.float32]  # (M,) field value under every point
     curvature: NDArray[np.float64]  # (3, 3) of the walls alone
@@ -60,7 +62,7 @@ def track(
 
 
 def better(a: Tracked, b: Tracked) -> Tracked:
-    return b if b.fraction > a.fraction + 0.01 else a
+    return b if b.score > a.score else a
 
 
 def best_fit(
@@ -75,7 +77,13 @@ def best_fit(
     n = len(starts)
     priors = np.broadcast_to(predicted, (n, 3))
     fit = refine(fields, np.full(n, particle), starts, priors, np.broadcast_to(weights, (n, 3, 3)), points_m)
-    fractions = fit.fractions()
-    i = int(np.argmax(fractions))
+    scores = fit.likelihood.sum(axis=1, dtype=np.float64) - objections(fit.poses, predicted, weights)
+    i = int(np.argmax(scores))
     ratio, _ = weakest_direction(fit.curvature[i])
-    return Tracked(fit.poses[i], float(fractions[i]), fit.likelihood[i], fit.curvature[i], ratio)
+    return Tracked(fit.poses[i], float(scores[i]), float(fit.fractions()[i]), fit.likelihood[i], fit.curvature[i], ratio)
+
+
+def objections(poses: Poses, predicted: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(P,) what odometry holds against each pose, in points that must fit to outweigh it."""
+    d = difference(poses, np.broadcast_to(predicted, poses.shape))
+    return np.minimum(0.5 * np.einsum("pi,ij,pj->p", d, weights, d), LARGEST_OBJECTION)
