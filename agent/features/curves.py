@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from protocol.features import CURVE_COLUMNS
 
 RADII_M = (0.6, 1.2, 2.4)
-MIN_FILL = 0.5  # wall in a piece, in radii: less is a splinter
+MIN_FILL = 1.0  # wall in a piece, in radii: less is a splinter
 MAX_POINTS = 2000
 MAX_STARTS = 250
-MAX_PER_RADIUS = 24
+MAX_PER_RADIUS = 16
 _SHIFTS = 3  # mean-shift steps; most settle in two
 
 

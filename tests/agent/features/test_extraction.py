@@ -133,4 +133,4 @@ def test_hostile_patterns_are_bounded(side):
     for cells in (checkerboard, dust):
         features = extract_features(OccupancyGrid(cells, 0.1))
         assert len(features.circles) + len(features.arcs) <= 64
-        assert len(features.curves) <= 72
+        assert len(features.curves) <= 48
