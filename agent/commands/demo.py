@@ -46,9 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robots", type=int, default=0, metavar="N", help="how many (default: 3; a recording is cut for 2)")
     parser.add_argument("--world", default="office", help="office, outdoor, random, a world file, or log:FILE.clf[.gz]")
     parser.add_argument("--seed", type=int, default=0, help="another building, other starts, other noise")
-    parser.add_argument(
-        "--duration", type=float, default=DURATION_S, metavar="S", help=f"seconds of exploring (default: {DURATION_S:.0f})"
-    )
+    parser.add_argument("--duration", type=float, metavar="S", help="seconds of exploring (default: 40, or the whole recording)")
     parser.add_argument(
         "--out", type=Path, default=Path("out/demo"), metavar="DIR", help="where pictures and figures go (default: out/demo)"
     )
@@ -69,6 +67,8 @@ def run(args: argparse.Namespace) -> int:
             stage = stack.enter_context(open_stage(args.world, args.robots, args.seed, folder))
         except DeviceConfigError as error:
             raise CommandError(str(error), USAGE) from error
+        if args.duration is None:
+            args.duration = stage.time_limit_s() if args.world.startswith("log:") else DURATION_S
         fleet = Fleet(stack, stage, folder)
         try:
             fleet.start()
@@ -183,6 +183,8 @@ class Show:
                 pose = status["mapping"].get("pose")
                 poses = {agent.robot: SE2(*pose)} if pose else {}
                 (out / f"{agent.robot}.png").write_bytes(png(map_picture(grid, poses, f"{agent.robot}: its own map")))
+        for agent in self.fleet.agents:
+            shutil.copy(agent.log_path, out)
         figures = self.figures(out)
         (out / "figures.json").write_text(json.dumps(asdict(figures), indent=1, default=str) + "\n")
         return figures
@@ -192,8 +194,8 @@ class Show:
         best = max(self.statuses, key=lambda s: (len(s["group"]), -s["uptime_s"]), default=None)
         fused = self.fused(best["robot"]) if best is not None and best["group"] else None
         if best is None or fused is None:
-            shutil.rmtree(out / "merged.png", ignore_errors=True)
-            return Figures(robots, [], None, [], 0.0, 0, None, **self.scans())
+            (out / "merged.png").unlink(missing_ok=True)
+            return Figures(robots, [], None, [], 0.0, 0, None, {}, *self.scans())
         truth, T_world_global = self.fleet.stage.truth(), None
         if truth is not None:
             root = self.fleet.stage.start_pose(best["root"])
@@ -210,12 +212,14 @@ class Show:
             conflicting_cells=best["global"]["conflicting_cells"] if best["global"] else 0,
             agreement=agreement(fused, truth, T_world_global) if truth is not None and T_world_global is not None else None,
             pose_errors_m=self.pose_errors(T_world_global),
-            **self.scans(),
+            scans=self.scans()[0],
+            scans_lost=self.scans()[1],
         )
 
-    def scans(self) -> dict[str, int]:
+    def scans(self) -> tuple[int, int]:
+        """How many scans came, and how many came too fast."""
         mappings = [s["mapping"] for s in self.statuses]
-        return {name: sum(m[name] for m in mappings) for name in ("scans", "scans_lost")}
+        return sum(m["scans"] for m in mappings), sum(m["scans_lost"] for m in mappings)
 
     def fused(self, robot: str) -> OccupancyGrid | None:
         return next(agent for agent in self.fleet.agents if agent.robot == robot).grid()
