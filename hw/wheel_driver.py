@@ -8,11 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from hw.arduino_bridge import ArduinoBridge
 from hw.clock import DeviceClock
+from hw.create2 import Create2
 from hw.driver import Drain, DriverBase, Pause, Reading, Script, Send
 from hw.errors import DeviceConfigError
+from hw.kobuki import Kobuki
 from hw.odometry import BaseProtocol, TickIntegrator, TickSample, WheelGeometry
+from hw.roboclaw import RoboClaw
 from hw.urls import DeviceUrl
+from hw.wheels import WheelBoard
 
 GEOMETRY = ("ticks", "radius", "track")
 OPTIONS = (*GEOMETRY, "v_max", "baud")
@@ -95,10 +100,41 @@ def v_max_of(url: DeviceUrl) -> float:
 
 
 def _wt1(url: DeviceUrl) -> WheelDriver:
-    from hw.wheels import WheelBoard  # noqa: PLC0415
-
     url.only(OPTIONS)
     return WheelDriver(WheelBoard(geometry_of(url), v_max_of(url)), "WT1 wheel encoders")
 
 
-BASES: dict[str, Callable[[DeviceUrl], WheelDriver]] = {"wheels": _wt1}
+def _create2(url: DeviceUrl) -> WheelDriver:
+    url.only(OPTIONS)
+    return WheelDriver(Create2(geometry_of(url)), "iRobot Create 2")
+
+
+def _kobuki(url: DeviceUrl) -> WheelDriver:
+    url.only(OPTIONS)
+    return WheelDriver(Kobuki(geometry_of(url)), "Kobuki")
+
+
+def _arduino(url: DeviceUrl) -> WheelDriver:
+    url.only(OPTIONS)
+    return WheelDriver(ArduinoBridge(_needed_geometry(url)), "ros_arduino_bridge")
+
+
+def _roboclaw(url: DeviceUrl) -> WheelDriver:
+    url.only((*OPTIONS, "address"))
+    return WheelDriver(RoboClaw(_needed_geometry(url), url.integer("address", 0x80, 0x80, 0x87)), "RoboClaw")
+
+
+def _needed_geometry(url: DeviceUrl) -> WheelGeometry:
+    geometry = geometry_of(url)
+    if geometry is None:
+        raise DeviceConfigError(f"{url.text}: this board does not know its wheels; add ?ticks=...&radius=...&track=... (metres)")
+    return geometry
+
+
+BASES: dict[str, Callable[[DeviceUrl], WheelDriver]] = {
+    "wheels": _wt1,
+    "create2": _create2,
+    "kobuki": _kobuki,
+    "arduino": _arduino,
+    "roboclaw": _roboclaw,
+}

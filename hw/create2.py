@@ -1,0 +1,90 @@
+"""iRobot Create 2 and Roomba 600 and later: the Open Interface's sensor stream, 16-bit encoders (SERIAL.md 7.1).
+
+    13 n {id data}* chk        every 15 ms once asked; big-endian; the low byte of the sum of the whole frame is 0
+
+Packets 43 and 44 count the wheels and wrap at 65536 both ways: 0.444565 mm a count, so after 29.1 m.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+
+from hw.framing import ByteWindow, Counters, SizedFrames
+from hw.odometry import TickSample, WheelGeometry
+
+HEADER = b"\x13"
+START, SAFE, STREAM, PAUSE_STREAM = 128, 131, 148, 150
+BUMPS, LEFT_ENCODER, RIGHT_ENCODER = 7, 43, 44
+SIZES = {7: 1, 13: 1, 19: 2, 20: 2, 22: 2, 25: 2, 26: 2, 29: 2, 35: 1, 43: 2, 44: 2, 58: 1}  # bytes of the packets we know
+MOST_BYTES = 170  # what fits a slot of 15 ms at 115200 baud
+METRES_PER_TICK = 0.072 * 3.141592653589793 / 508.8
+TRACK_M = 0.235
+MAX_SPEED_MPS = 0.5
+
+
+def encode_stream(values: Mapping[int, int]) -> bytes:
+    """A stream frame with these packets, in their order."""
+    body = b"".join(bytes((packet,)) + value.to_bytes(SIZES[packet], "big") for packet, value in values.items())
+    frame = HEADER + bytes((len(body),)) + body
+    return frame + bytes((-sum(frame) & 0xFF,))
+
+
+def decode_stream(frame: bytes) -> dict[int, int] | None:
+    """{packet: value} of a whole frame; None when it is none, or holds a packet whose size we do not know."""
+    if len(frame) < 4 or frame[:1] != HEADER or len(frame) != frame[1] + 3 or sum(frame) & 0xFF:
+        return None
+    values, at = {}, 2
+    while at < len(frame) - 1:
+        size = SIZES.get(frame[at], 0)
+        if not size or at + 1 + size > len(frame) - 1:
+            return None
+        values[frame[at]] = int.from_bytes(frame[at + 1 : at + 1 + size], "big")
+        at += 1 + size
+    return values
+
+
+def stream_request(packets: tuple[int, ...]) -> bytes:
+    """Ask for these packets every 15 ms."""
+    return bytes((STREAM, len(packets), *packets))
+
+
+def drive_direct(left_mm_s: int, right_mm_s: int) -> bytes:
+    """Wheel speeds, -500 to 500 mm/s."""
+    return struct.pack(">Bhh", 145, right_mm_s, left_mm_s)
+
+
+class Create2:
+    """`BaseProtocol` of a Create 2."""
+
+    baud_rates: tuple[int, ...] = (115200, 19200)
+    poll_period_s = 0.0
+
+    def __init__(self, geometry: WheelGeometry | None = None) -> None:
+        self.geometry = geometry or WheelGeometry(METRES_PER_TICK, TRACK_M, MAX_SPEED_MPS)
+        self.counters = Counters()
+        self._window = ByteWindow(self.counters)
+        self._finder = SizedFrames(HEADER, 2, MOST_BYTES + 3, _size, lambda frame: decode_stream(frame) is not None)
+
+    def start_requests(self) -> list[bytes]:
+        return [bytes((START,)), bytes((SAFE,)), stream_request((LEFT_ENCODER, RIGHT_ENCODER)), bytes((PAUSE_STREAM, 1))]
+
+    def stop_requests(self) -> list[bytes]:
+        return [bytes((PAUSE_STREAM, 0))]
+
+    def poll_request(self) -> bytes:
+        return b""
+
+    def feed(self, data: bytes) -> list[TickSample]:
+        """Samples that these bytes complete."""
+        self._window.push(data)
+        samples = []
+        for frame in self._finder.take(self._window, self.counters).data:
+            values = decode_stream(bytes(frame[: int(frame[1]) + 3])) or {}
+            if LEFT_ENCODER in values and RIGHT_ENCODER in values:
+                samples.append(TickSample(values[LEFT_ENCODER], values[RIGHT_ENCODER], 16))
+        return samples
+
+
+def _size(data: bytearray) -> int:
+    return data[1] + 3 if 2 <= data[1] <= MOST_BYTES else 0
