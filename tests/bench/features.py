@@ -1,6 +1,6 @@
 """How features bear noise, and how the time of every stage of merging grows with the number of features and the size of the map.
 
-.venv/bin/python -m tests.bench.features            two tables, and out/bench/features_*.svg
+.venv/bin/python -m tests.bench.features            tables, and out/bench/features_*.svg
 .venv/bin/python -m tests.bench.features --json
 """
 
@@ -28,11 +28,14 @@ from agent.merging.matched_features import matched_features
 from agent.merging.matching import match_maps
 from agent.merging.paper import rotation_candidates, similar_features, translation_candidates
 from protocol.features import FeatureMap
+from protocol.fields import FEATURES
 from protocol.geometry import SE2, wrap_angle
 from tests.bench.line_chart import exponent, log_log_chart
+from tests.bench.map_pairs import kit_pairs
 from tests.harness.floorplans import office
 
 OUT = Path(__file__).resolve().parents[2] / "out" / "bench"
+KINDS = ("lines", "circles", "arcs", "curves")
 NOISE_M = (0.0, 0.02, 0.04, 0.06, 0.1)
 ROOMS = (4, 8, 16, 32, 64)
 T_A, T_B = SE2(3.0, -2.0, 0.3), SE2(-10.0, 5.0, 2.1)
@@ -54,7 +57,7 @@ def against_noise(seeds: range) -> list[dict[str, Any]]:
 
 def _repeated(pairs: list[tuple[FeatureMap, FeatureMap]]) -> dict[str, Any]:
     T = T_A @ T_B.inverse()
-    found: dict[str, list[float]] = {kind: [] for kind in ("lines", "circles", "arcs", "curves")}
+    found: dict[str, list[float]] = {kind: [] for kind in KINDS}
     counts: dict[str, list[int]] = {kind: [] for kind in found}
     turn, across = [], []
     for ours, theirs in pairs:
@@ -111,6 +114,27 @@ def _stages(rooms: int) -> dict[str, Any]:
     }
 
 
+def of_recordings() -> list[dict[str, Any]]:
+    """Features of the kit's maps, the median of each building: how many, how many bytes on the wire, CPU."""
+    by_log: dict[str, list[list[float]]] = {}
+    for pair in kit_pairs("main", "pos", stride=3):
+        started = time.process_time()
+        features = extract_features(pair.ours)
+        cpu_ms = (time.process_time() - started) * 1e3
+        counts = [len(getattr(features, kind)) for kind in KINDS]
+        row = [*counts, _wire_bytes(FeatureMap(lines=features.lines)), _wire_bytes(features), cpu_ms]
+        by_log.setdefault(pair.name.split()[1], []).append(row)
+    names = [*KINDS, "line_bytes", "all_bytes", "cpu_ms"]
+    return [
+        {"recording": log, **dict(zip(names, np.round(np.median(rows, axis=0), 1).tolist(), strict=True))}
+        for log, rows in by_log.items()
+    ]
+
+
+def _wire_bytes(features: FeatureMap) -> int:
+    return len(FEATURES.pack(features)[1])
+
+
 def _ms(work: Callable[[], object]) -> float:
     """Median CPU of five runs after a first one."""
     work()
@@ -122,9 +146,9 @@ def _ms(work: Callable[[], object]) -> float:
     return round(max(0.01, float(np.median(times))), 2)
 
 
-def as_markdown(noise: list[dict[str, Any]], size: list[dict[str, Any]]) -> str:
-    tables = []
-    for rows in (noise, size):
+def as_markdown(*of: list[dict[str, Any]]) -> str:
+    tables, size = [], of[1]
+    for rows in filter(None, of):
         tables.append("| " + " | ".join(rows[0]) + " |\n|" + "---|" * len(rows[0]))
         tables[-1] += "".join("\n| " + " | ".join("-" if v is None else str(v) for v in row.values()) + " |" for row in rows)
     growth = [
@@ -153,12 +177,12 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10, help="buildings per noise level (default 10)")
     args = parser.parse_args()
     cv2.setNumThreads(1)
-    noise, size = against_noise(range(args.seeds)), against_size()
+    noise, size, recordings = against_noise(range(args.seeds)), against_size(), of_recordings()
     charts = draw(size)
     if args.json:
-        print(json.dumps({"noise": noise, "size": size}, indent=1))
+        print(json.dumps({"noise": noise, "size": size, "recordings": recordings}, indent=1))
     else:
-        print(as_markdown(noise, size))
+        print(as_markdown(noise, size, recordings))
         print("\n" + "\n".join(f"chart: {path}" for path in charts))
 
 
