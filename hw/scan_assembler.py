@@ -23,6 +23,7 @@ from hw.readings import LaserScan
 FULL_COVERAGE = 0.95  # issue D: below, a scan is partial and never clears free space
 LEAST_COVERAGE = 0.25  # below, a revolution is not worth handing on
 LONGEST_HOLE = 0.45  # share of a revolution: after a longer hole its cut cannot be told from the next one's
+LEAST_PERIOD_S, MOST_PERIOD_S = 0.03, 2.0  # 30 turns a second to one in two
 MAX_BEAMS = 20000  # a stuck motor turns no more: its revolution never ends
 
 Floats = NDArray[np.float64]
@@ -60,6 +61,7 @@ class ScanAssembler:
     def __init__(self, range_min_m: float, range_max_m: float) -> None:
         self.range_min_m, self.range_max_m = range_min_m, range_max_m
         self.period_s = 0.1  # of the last whole revolution
+        self._hole_s = LONGEST_HOLE * self.period_s
         self.coverage = 0.0  # of the last scan
         self.witnesses: tuple[int, ...] = (1,)  # see `supported_only`
         self.discarded = 0  # revolutions with too little in them
@@ -100,7 +102,9 @@ class ScanAssembler:
         step_deg = np.diff(beams.turn_deg, prepend=first_turn_deg)
         step_s = np.diff(beams.stamps_s, prepend=first_stamp_s)
         self._last_turn_deg, self._last_stamp_s = float(beams.turn_deg[-1]), float(beams.stamps_s[-1])
-        is_hole = step_s > LONGEST_HOLE * self.period_s
+        is_hole = step_s > self._hole_s
+        if is_hole.any():  # or the turn is slower than was thought: a wrong period must not make holes for ever
+            self._hole_s = min(1.5 * self._hole_s, MOST_PERIOD_S)
         where = np.flatnonzero(is_hole | (step_deg < -180))
         return [(int(i), bool(is_hole[i])) for i in where]
 
@@ -117,8 +121,9 @@ class ScanAssembler:
             return None
         beams = _joined(self._pending)
         duration_s = float(beams.stamps_s[-1] - beams.stamps_s[0])
-        if 0.01 < duration_s < 2.0:
+        if LEAST_PERIOD_S < duration_s < MOST_PERIOD_S:
             self.period_s = duration_s
+            self._hole_s = LONGEST_HOLE * duration_s
         coverage = coverage_of(beams.turn_deg)
         is_dirty = beams.is_dirty is not None and bool(beams.is_dirty.any())
         must_filter, self._was_dirty = is_dirty or self._was_dirty, is_dirty
@@ -191,7 +196,7 @@ def supported_only(ranges_m: Floats, steps: tuple[int, ...] = (1,)) -> Floats:
     return np.where(stands, ranges_m, np.nan)
 
 
-UNEVEN_RAD = np.radians(0.2)  # 2 cm at 5 m
+UNEVEN_RAD = np.radians(0.13)  # one step of an express capsule's offsets; 1 cm at 5 m
 
 
 def is_evenly_spaced(angles_rad: Floats) -> NDArray[np.bool_]:

@@ -130,7 +130,10 @@ class SpinningLidar(DriverBase):
         gaps = np.concatenate([held.gap for held in self._held])
         arrivals_s = np.concatenate(self._held_arrivals_s)
         self._drop_held()
-        scans = self._assembler.add(self._beams(*self._witnessed(data, gaps, arrivals_s)))
+        believed = self._witnessed(data, gaps, arrivals_s)
+        if len(believed[0]) == 0:
+            return []
+        scans = self._assembler.add(self._beams(*believed))
         self.period_s = self._assembler.period_s
         return list(scans)
 
