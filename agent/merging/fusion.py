@@ -56,7 +56,7 @@ def fuse(maps: Sequence[tuple[OccupancyGrid, SE2]], resolution_m: float | None =
     if not known:
         return _nothing_known(cell_m)
     lattice = lattice_around(np.concatenate([corners_of(grid, T) for grid, T in known]), cell_m)
-    _check_size(lattice)
+    _check_size(lattice, [grid for grid, _ in known])
     votes = _Votes.none(lattice, coarsest_m=max(grid.resolution_m for grid, _ in known))
     ranks = sorted({grid.resolution_m for grid, _ in known})
     for grid, T_global_map in known:
@@ -79,8 +79,9 @@ def _check(maps: Sequence[tuple[OccupancyGrid, SE2]], cell_m: float) -> None:
         raise FusionError(f"a target resolution of {cell_m} m; it must be positive")
 
 
-def _check_size(lattice: Lattice) -> None:
-    if lattice.cell_count > MAX_FUSED_CELLS or max(lattice.height, lattice.width) > MAX_FUSED_SIDE_CELLS:
+def _check_size(lattice: Lattice, maps: Sequence[OccupancyGrid]) -> None:
+    longest = max(max(grid.cells.shape) * max(1.0, grid.resolution_m / lattice.resolution_m) for grid in maps)
+    if lattice.cell_count > MAX_FUSED_CELLS or max(lattice.height, lattice.width, 1.5 * longest) > MAX_FUSED_SIDE_CELLS:
         m = lattice.resolution_m
         raise FusionError(
             f"the maps together span {lattice.width * m:.4g} m x {lattice.height * m:.4g} m, "

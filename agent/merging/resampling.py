@@ -18,6 +18,9 @@ from protocol.geometry import SE2
 from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 _MAX_SAMPLES = 6  # per axis and cell when shrinking: beyond a factor of six a denser vote changes nothing that matters
+_BITS = 32  # of a cell: 32,000 cells further the error is a hundred-thousandth of a cell
+_SIDE = 32_766  # beyond every source image that cv2 takes
+_UNKNOWN_BYTE = UNKNOWN & 0xFF
 _NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))  # each touching pair of cells once, (row, col)
 
 
@@ -72,6 +75,13 @@ def resampled(grid: OccupancyGrid, T_target_map: SE2, lattice: Lattice) -> NDArr
     return cells
 
 
+def resampled_like(target: OccupancyGrid, grid: OccupancyGrid, T_target_map: SE2) -> NDArray[np.int8]:
+    """Cells of the grid on the lattice of `target`, a fused grid: parallel to its frame, its lines through the origin."""
+    cell_m = target.resolution_m
+    lattice = Lattice(cell_m, round(target.origin.y_m / cell_m), round(target.origin.x_m / cell_m), target.height, target.width)
+    return resampled(grid, T_target_map, lattice)
+
+
 def _subdivided(grid: OccupancyGrid, resolution_m: float) -> OccupancyGrid:
     """The same map with cells no larger than the target's."""
     factor = math.ceil(grid.resolution_m / resolution_m - 1e-6)
@@ -81,59 +91,65 @@ def _subdivided(grid: OccupancyGrid, resolution_m: float) -> OccupancyGrid:
     return OccupancyGrid(cells, grid.resolution_m / factor, grid.origin)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _CellMotion:
+    """Where cells of one raster fall in another, in whole numbers: every processor finds the same cell, to the last bit.
+
+    cv2's own warping rounds differently with and without vector units, and robots compare hashes of the maps they fuse.
+    """
+
+    steps: NDArray[np.int64]  # (2, 3) rows x and y; columns per half column, per half row, offset; in 2^-_BITS of a cell
+
+    @staticmethod
+    def of(T_to_from: SE2, from_m: float, to_m: float, from_cell: tuple[int, int], to_cell: tuple[int, int]) -> _CellMotion:
+        """Cells of `from_m` in one frame to cells of `to_m` in another; the cells are (col, row) of the rasters' corners."""
+        linear = T_to_from.rotation() * (from_m / to_m)
+        offset = np.array([T_to_from.x_m, T_to_from.y_m]) / to_m + linear @ from_cell - to_cell
+        return _CellMotion(np.rint(np.column_stack([linear / 2, offset]) * (1 << _BITS)).astype(np.int64))
+
+    def at(self, half_cols: NDArray[np.int64], half_rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """(row, col) of points given in half cells, so that a cell's centre has odd numbers; arrays broadcast."""
+        (ax, bx, cx), (ay, by, cy) = self.steps
+        return (ay * half_cols + (by * half_rows + cy)) >> _BITS, (ax * half_cols + (bx * half_rows + cx)) >> _BITS
+
+
 def _area_vote(source: OccupancyGrid, T_target_grid: SE2, lattice: Lattice) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Cells mostly free, and cells with any wall sample, by backward sampling on a small raster within each cell."""
     n = min(_MAX_SAMPLES, max(1, math.ceil(lattice.resolution_m / source.resolution_m - 1e-6)))
-    image = np.select([source.cells == FREE, source.cells == OCCUPIED], [1, 2], 0).astype(np.uint8)
+    image = np.ascontiguousarray(source.cells).view(np.uint8)
+    motion = _CellMotion.of(
+        T_target_grid.inverse(), lattice.resolution_m / n, source.resolution_m, (lattice.col0 * n, lattice.row0 * n), (0, 0)
+    )
     free = np.zeros((lattice.height, lattice.width), np.uint8)
     occupied = np.zeros_like(free)
     for i in range(n * n):
-        offset = ((i % n + 0.5) / n, (i // n + 0.5) / n)
-        seen = _sampled(image, _pixel_map(T_target_grid, source.resolution_m, lattice, offset), free.shape)
-        free += seen == 1
-        occupied += seen == 2
+        half_cols = 2 * (n * np.arange(lattice.width) + i % n) + 1
+        half_rows = 2 * (n * np.arange(lattice.height) + i // n) + 1
+        row, col = motion.at(half_cols[None, :], half_rows[:, None])
+        there = np.stack([np.clip(col, -1, _SIDE), np.clip(row, -1, _SIDE)], axis=2).astype(np.int16)
+        seen = cv2.remap(image, there, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=_UNKNOWN_BYTE)
+        free += seen == FREE
+        occupied += seen == OCCUPIED
     return 2 * free.astype(np.int16) >= n * n, occupied > 0
-
-
-def _pixel_map(
-    T_target_grid: SE2, source_resolution_m: float, lattice: Lattice, offset: tuple[float, float]
-) -> NDArray[np.float64]:
-    """(2, 3) target pixel -> source pixel, for the point at `offset` (0..1) within each target cell.
-
-    The centre of cv2's pixel k lies at k, that of our cell k at k + 0.5.
-    """
-    T_grid_target = T_target_grid.inverse().matrix()
-    to_metres = np.array(
-        [
-            [lattice.resolution_m, 0.0, (lattice.col0 + offset[0]) * lattice.resolution_m],
-            [0.0, lattice.resolution_m, (lattice.row0 + offset[1]) * lattice.resolution_m],
-            [0.0, 0.0, 1.0],
-        ]
-    )
-    M: NDArray[np.float64] = (T_grid_target @ to_metres)[:2] / source_resolution_m
-    M[:, 2] -= 0.5
-    return M
-
-
-def _sampled(image: NDArray[np.uint8], M: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
-    out: NDArray[np.uint8] = cv2.warpAffine(image, M, (shape[1], shape[0]), flags=flags, borderValue=0)
-    return out
 
 
 def _carried_walls(source: OccupancyGrid, T_target_grid: SE2, lattice: Lattice) -> NDArray[np.bool_]:
     """Target cells that hold the centre of a wall cell, or bridge two touching wall cells that landed apart."""
+    motion = _CellMotion.of(T_target_grid, source.resolution_m, lattice.resolution_m, (0, 0), (lattice.col0, lattice.row0))
     walls = np.zeros((lattice.height, lattice.width), np.bool_)
     wall = source.cells == OCCUPIED
-    _mark(walls, _landed(np.argwhere(wall), source.resolution_m, T_target_grid, lattice))
+    _mark(walls, _landed(motion, 2 * np.argwhere(wall) + 1))
     for dr, dc in _NEIGHBOURS:
-        first = _first_of_touching_pairs(wall, dr, dc)
-        a = _landed(first, source.resolution_m, T_target_grid, lattice)
-        b = _landed(first + np.array([dr, dc]), source.resolution_m, T_target_grid, lattice)
+        first = 2 * _first_of_touching_pairs(wall, dr, dc) + 1
+        step = np.array([dr, dc])
+        a, b = _landed(motion, first), _landed(motion, first + 2 * step)
         apart = np.abs(a - b).max(axis=1, initial=0) > 1
-        middle = first[apart] + np.array([dr / 2, dc / 2])
-        _mark(walls, _landed(middle, source.resolution_m, T_target_grid, lattice))
+        _mark(walls, _landed(motion, first[apart] + step))
     return walls
+
+
+def _landed(motion: _CellMotion, half_cells_rc: NDArray[np.int64]) -> NDArray[np.int64]:
+    return np.stack(motion.at(half_cells_rc[:, 1], half_cells_rc[:, 0]), axis=1)
 
 
 def _first_of_touching_pairs(wall: NDArray[np.bool_], dr: int, dc: int) -> NDArray[np.int64]:
@@ -142,11 +158,6 @@ def _first_of_touching_pairs(wall: NDArray[np.bool_], dr: int, dc: int) -> NDArr
     here, there = wall[: h - dr, max(0, -dc) : w - max(0, dc)], wall[dr:, max(0, dc) : w - max(0, -dc)]
     first: NDArray[np.int64] = np.argwhere(here & there) + np.array([0, max(0, -dc)])
     return first
-
-
-def _landed(cells_rc: NDArray[np.generic], resolution_m: float, T_target_grid: SE2, lattice: Lattice) -> NDArray[np.int64]:
-    points = (cells_rc.astype(np.float64)[:, ::-1] + 0.5) * resolution_m
-    return lattice.cells_at(T_target_grid.apply(points))
 
 
 def _mark(mask: NDArray[np.bool_], cells_rc: NDArray[np.int64]) -> None:
@@ -160,10 +171,3 @@ def _enclosed(walls: NDArray[np.bool_]) -> NDArray[np.bool_]:
     sides = cv2.filter2D(walls.astype(np.uint8), cv2.CV_8U, cross, borderType=cv2.BORDER_CONSTANT)
     pinholes: NDArray[np.bool_] = np.greater_equal(sides, 3)
     return pinholes
-
-
-def resampled_like(target: OccupancyGrid, grid: OccupancyGrid, T_target_map: SE2) -> NDArray[np.int8]:
-    """Cells of the grid on the lattice of `target`, a fused grid: parallel to its frame, its lines through the origin."""
-    cell_m = target.resolution_m
-    lattice = Lattice(cell_m, round(target.origin.y_m / cell_m), round(target.origin.x_m / cell_m), target.height, target.width)
-    return resampled(grid, T_target_map, lattice)

@@ -63,6 +63,17 @@ def test_a_map_always_agrees_with_itself(placed):
 
 
 @settings(deadline=None)
+@given(st.lists(placed_grids, min_size=1, max_size=3))
+def test_every_processor_fuses_the_same_bits(maps):
+    hashes = []
+    for is_optimized in (True, False):
+        cv2.setUseOptimized(is_optimized)
+        hashes.append(fuse(maps).grid.content_hash())
+    cv2.setUseOptimized(True)
+    assert hashes[0] == hashes[1]
+
+
+@settings(deadline=None)
 @given(st.lists(placed_grids, min_size=2, max_size=4))
 def test_fusion_invents_no_knowledge(maps):
     fused = fuse(maps).grid
@@ -151,6 +162,7 @@ def test_maps_that_know_nothing_fuse_to_one_unknown_cell(cells):
         ([(room(), SE2(0, 1e300, 0))], None, "map 0 of 1"),
         ([(room(), HERE), (room(), SE2(1e6, 1e6, 0))], None, f"{MAX_FUSED_CELLS:,} cells"),
         ([(room(), HERE), (room(), SE2(5e3, 0, 0))], None, "32,000 a side"),
+        ([(OccupancyGrid(np.zeros((2, 30_000), np.int8), 0.01), SE2(0, 0, 0.8))], 0.05, "32,000 a side"),
         ([(OccupancyGrid(np.zeros((2, 2), np.int8), -0.1), HERE)], None, "resolution of -0.1"),
         ([(room(), HERE)], math.inf, "target resolution of inf"),
         ([(room(), HERE)], 0.0, "target resolution of 0.0"),
