@@ -15,7 +15,7 @@ from agent.features.lines import WallLines
 BINS = 1440  # a quarter of a degree
 MAX_WEIGHT_M = 15.0  # one long corridor must not drown a whole office
 MAX_SIGMA_DEG = 2.0
-BLUR_DEG = 0.35  # lines of one building are parallel to about this
+BLUR_DEG = 0.7  # lines of one building are parallel to about this
 
 
 def direction_spectrum(lines: WallLines) -> NDArray[np.complex128]:
@@ -34,5 +34,5 @@ def direction_spectrum(lines: WallLines) -> NDArray[np.complex128]:
     return spectrum
 
 
-SIGMA_STEPS_DEG = np.array([0.45, 0.7, 1.1, 1.7])
-SIGMA_CENTRES_DEG = (0.38, 0.55, 0.9, 1.4, 2.0)
+SIGMA_STEPS_DEG = np.array([0.8, 1.05, 1.4, 1.8])
+SIGMA_CENTRES_DEG = (0.73, 0.9, 1.2, 1.6, 2.1)

@@ -33,6 +33,7 @@ class MatchField:
     nearest: NDArray[
         np.float32
     ]  # (H, W) index of the nearest wall point, -1 beyond REACH_M; float because cv2.remap takes no int32
+    distance_m: NDArray[np.float32]  # (H, W) to the nearest wall
     resolution_m: float
 
     @staticmethod
@@ -45,6 +46,7 @@ class MatchField:
             np.where(distance_m <= max(FINE_TOLERANCE_M, 1.25 * grid.resolution_m), direction, nothing),
             np.where(distance_m <= max(COARSE_TOLERANCE_M, 1.5 * grid.resolution_m), direction, nothing),
             np.where(distance_m <= REACH_M, nearest, -1).astype(np.float32),
+            distance_m,
             grid.resolution_m,
         )
 

@@ -18,11 +18,14 @@ from protocol.features import FeatureTable
 from protocol.geometry import SE2
 
 MIN_LENGTH_M = 0.8
-MAX_RMS_M = 0.15
+MAX_AWAY_M = 0.15  # a point farther from its line is not on it
+_TRIMS_M = (0.12, 0.08, 0.08)
 MIN_LINEARITY = 0.5
+MIN_POINTS = 4
 LAYER_HALF_WIDTH_DEG = 17
 MAX_LAYERS = 12
-PAINT_CELL_M = 0.2
+ALONG_CELL_M = 0.4  # gaps up to this are bridged: posts, not doors
+ACROSS_CELL_M = 0.12  # parallel walls this far apart are two
 MAX_LINES = 2000
 SAMPLE_M = 0.3  # wall points closer than this do not err independently
 
@@ -36,6 +39,7 @@ class WallLines:
     lengths_m: NDArray[np.float64]  # (N,)
     sigma_theta_rad: NDArray[np.float64]  # (N,)
     sigma_rho_m: NDArray[np.float64]  # (N,)
+    support_m: NDArray[np.float64]  # (wall points,) length of the line a wall point lies on, 0 for none
 
     def __len__(self) -> int:
         return len(self.angles_rad)
@@ -63,10 +67,17 @@ def wall_lines(walls: WallPoints, resolution_m: float) -> WallLines:
     """The straight pieces of wall of one map."""
     straight = np.flatnonzero(walls.linearity > MIN_LINEARITY)
     points, angles = walls.positions_m[straight].astype(np.float64), walls.angles_rad[straight]
-    found = [_pieces(points, angles, centre, resolution_m) for centre in _layer_centres(angles)]
-    rows = np.concatenate([np.zeros((0, 6)), *found])
+    support = np.zeros(len(walls))
+    found = [np.zeros((0, 6))]
+    for centre in _layer_centres(angles):
+        mine = np.flatnonzero(angle_apart(angles, centre) < math.radians(LAYER_HALF_WIDTH_DEG))
+        if len(mine) >= MIN_POINTS:
+            rows, lengths = _pieces(points[mine], centre, resolution_m)
+            found.append(rows)
+            support[straight[mine]] = np.maximum(support[straight[mine]], lengths)
+    rows = np.concatenate(found)
     rows = rows[np.argsort(-rows[:, 3], kind="stable")[:MAX_LINES]]
-    return WallLines(rows[:, :2], rows[:, 2], rows[:, 3], rows[:, 4], rows[:, 5])
+    return WallLines(rows[:, :2], rows[:, 2], rows[:, 3], rows[:, 4], rows[:, 5], support)
 
 
 def _layer_centres(angles_rad: NDArray[np.floating]) -> list[float]:
@@ -87,53 +98,58 @@ def _layer_centres(angles_rad: NDArray[np.floating]) -> list[float]:
     return centres
 
 
-def _pieces(
-    points: NDArray[np.float64], angles: NDArray[np.floating], centre_rad: float, resolution_m: float
-) -> NDArray[np.float64]:
-    """(N, 6) middle, angle, length, sigma_theta, sigma_rho of the lines in one layer."""
-    away = np.abs(np.remainder(angles - centre_rad + math.pi, math.tau) - math.pi)
-    mine = points[away < math.radians(LAYER_HALF_WIDTH_DEG)]
-    if len(mine) < 4:
-        return np.zeros((0, 6))
+def _pieces(mine: NDArray[np.float64], centre_rad: float, resolution_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(N, 6) middle, angle, length, sigma_theta, sigma_rho of the lines in one layer; and for every point its line's length."""
     normal = np.array([math.cos(centre_rad), math.sin(centre_rad)])
     tangent = np.array([normal[1], -normal[0]])  # so that (tangent, normal) is right-handed
     along, across = mine @ tangent, mine @ normal
-    piece = _connected(mine)
-    n = np.bincount(piece).astype(np.float64)
-    mean_u, mean_v = np.bincount(piece, along) / n, np.bincount(piece, across) / n
-    du, dv = along - mean_u[piece], across - mean_v[piece]
-    suu, svv, suv = (np.bincount(piece, w) / n for w in (du * du, dv * dv, du * dv))
-    turn = 0.5 * np.arctan2(2 * suv, suu - svv)
-    across_line = dv * np.cos(turn)[piece] - du * np.sin(turn)[piece]
-    along_line = du * np.cos(turn)[piece] + dv * np.sin(turn)[piece]
-    rms = np.sqrt(np.bincount(piece, across_line**2) / n)
-    low, high = _extremes(along_line, piece, len(n))
-    length = high - low
-    keep = (length >= MIN_LENGTH_M) & (rms < MAX_RMS_M) & (n >= 4)
+    piece = _connected(along, across)
+    pieces = int(piece.max()) + 1
+    weight = np.ones(len(mine))
+    for reach_m in _TRIMS_M:  # a bulge or a door frame must not tilt the wall
+        n = np.maximum(np.bincount(piece, weight, pieces), 1e-9)
+        mean_u, mean_v = np.bincount(piece, weight * along, pieces) / n, np.bincount(piece, weight * across, pieces) / n
+        du, dv = along - mean_u[piece], across - mean_v[piece]
+        suu, svv, suv = (np.bincount(piece, weight * w, pieces) / n for w in (du * du, dv * dv, du * dv))
+        turn = 0.5 * np.arctan2(2 * suv, suu - svv)
+        c, s = np.cos(turn), np.sin(turn)
+        beside, ahead = dv * c[piece] - du * s[piece], du * c[piece] + dv * s[piece]
+        weight = (np.abs(beside) < reach_m).astype(np.float64)
+    n = np.bincount(piece, weight, pieces)
+    rms = np.sqrt(np.bincount(piece, weight * beside**2, pieces) / np.maximum(n, 1))
+    low, high = _extremes(ahead, piece, weight > 0, pieces)
+    length = np.maximum(high - low, 0.0)
+    keep = (length >= MIN_LENGTH_M) & (n >= MIN_POINTS) & (n >= 0.5 * np.bincount(piece, minlength=pieces))
     shift = 0.5 * (low + high)
-    middle_u, middle_v = mean_u + shift * np.cos(turn), mean_v + shift * np.sin(turn)
-    middles = middle_u[:, None] * tangent + middle_v[:, None] * normal
-    spread = np.maximum(rms, 0.29 * resolution_m)
-    independent = np.sqrt(np.maximum(2.0, length / SAMPLE_M))
-    sigma_rho = spread / independent
+    middles = (mean_u + shift * c)[:, None] * tangent + (mean_v + shift * s)[:, None] * normal
+    sigma_rho = np.maximum(rms, 0.29 * resolution_m) / np.sqrt(np.maximum(2.0, length / SAMPLE_M))
     sigma_theta = math.sqrt(12) * sigma_rho / np.maximum(length, 1e-6)
     angle = np.remainder(centre_rad + turn + math.pi, math.tau) - math.pi
-    return np.column_stack([middles, angle, length, sigma_theta, sigma_rho])[keep]
+    rows = np.column_stack([middles, angle, length, sigma_theta, sigma_rho])[keep]
+    return rows, np.where(keep[piece] & (np.abs(beside) < MAX_AWAY_M), length[piece], 0.0)
 
 
-def _connected(points_m: NDArray[np.float64]) -> NDArray[np.int32]:
-    """(N,) number of the connected piece each point belongs to, 0 .. pieces - 1."""
-    cells = np.floor((points_m - points_m.min(axis=0)) / PAINT_CELL_M).astype(np.int32) + 1
-    width, height = cells.max(axis=0) + 2
-    image = np.zeros((height, width), np.uint8)
-    image[cells[:, 1], cells[:, 0]] = 1
-    image = cv2.dilate(image, np.ones((3, 3), np.uint8))
+def angle_apart(angles_rad: NDArray[np.floating], centre_rad: float) -> NDArray[np.floating]:
+    """Unsigned angle from a direction, in [0, pi]."""
+    apart: NDArray[np.floating] = np.abs(np.remainder(angles_rad - centre_rad + math.pi, math.tau) - math.pi)
+    return apart
+
+
+def _connected(along_m: NDArray[np.float64], across_m: NDArray[np.float64]) -> NDArray[np.int64]:
+    """(N,) number of the connected piece each point belongs to, 0 .. pieces - 1: joined along the wall, not across."""
+    u = np.floor((along_m - along_m.min()) / ALONG_CELL_M).astype(np.int64) + 1
+    v = np.floor((across_m - across_m.min()) / ACROSS_CELL_M).astype(np.int64) + 1
+    image = np.zeros((int(v.max()) + 2, int(u.max()) + 2), np.uint8)
+    image[v, u] = 1
     _, labels = cv2.connectedComponents(image, connectivity=8, ltype=cv2.CV_32S)
-    return np.unique(labels[cells[:, 1], cells[:, 0]], return_inverse=True)[1].astype(np.int32)
+    pieces: NDArray[np.int64] = np.unique(labels[v, u], return_inverse=True)[1].astype(np.int64)
+    return pieces
 
 
-def _extremes(values: NDArray[np.float64], group: NDArray[np.int32], groups: int) -> tuple[NDArray[np.float64], ...]:
-    low, high = np.full(groups, np.inf), np.full(groups, -np.inf)
-    np.minimum.at(low, group, values)
-    np.maximum.at(high, group, values)
+def _extremes(
+    values: NDArray[np.float64], group: NDArray[np.int64], counted: NDArray[np.bool_], groups: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    low, high = np.full(groups, 1e9), np.full(groups, -1e9)
+    np.minimum.at(low, group[counted], values[counted])
+    np.maximum.at(high, group[counted], values[counted])
     return low, high

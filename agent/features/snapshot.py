@@ -14,8 +14,11 @@ from numpy.typing import NDArray
 
 from agent.features.corners import Corners, corners_of
 from agent.features.directions import direction_spectrum
-from agent.features.field import MatchField
+from agent.features.extraction import feature_map
+from agent.features.field import UNKNOWN_BYTE, MatchField
 from agent.features.lines import WallLines, wall_lines
+from agent.features.signatures import Signatures, signatures_of
+from agent.features.structure import structure_kinds
 from agent.features.wall_points import WallPoints, wall_points
 from agent.features.working import WorkingGrid
 from protocol.features import FeatureMap
@@ -64,7 +67,17 @@ class MapSnapshot:
     @cached_property
     def thin_walls(self) -> WallPoints:
         """One oriented point every 20 cm of wall."""
-        return self.walls.thin
+        return self.walls.subset(self.walls.thin)
+
+    @cached_property
+    def kinds(self) -> NDArray[np.uint8]:
+        """(N,) what every surface cell is part of: `agent.features.structure`."""
+        return structure_kinds(self.working, self.walls, self.lines.support_m)
+
+    @cached_property
+    def thin_kinds(self) -> NDArray[np.uint8]:
+        """The same for `thin_walls`."""
+        return self.kinds[self.walls.thin]
 
     @cached_property
     def field(self) -> MatchField:
@@ -84,6 +97,11 @@ class MapSnapshot:
         return direction_spectrum(self.lines)
 
     @cached_property
+    def signatures(self) -> Signatures:
+        known = (self.field.fine != UNKNOWN_BYTE) | self.working.free.view(np.bool_)
+        return signatures_of(self.thin_walls, self.thin_kinds, self.field.distance_m, known, self.working.resolution_m)
+
+    @cached_property
     def features(self) -> FeatureMap:
         """What travels and what a person can read."""
-        return FeatureMap(lines=self.lines.table(self.grid.origin))
+        return feature_map(self.working, self.walls, self.lines, self.grid.origin)

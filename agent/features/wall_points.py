@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from agent.features.working import WorkingGrid
 
 WINDOW_M = 0.45  # radius in which the local line is fitted: shorter is noisy, longer rounds corners off
+ACROSS_CELLS = 1.0  # cells of a wall beside a point: more would mix in its far side
 SPACING_M = 0.20  # one point stands for this much wall
 MAX_SURFACE_CELLS = 150_000  # a checkerboard is all surface; a 250 m campus has 40,000
 
@@ -41,14 +42,15 @@ class WallPoints:
         return angles
 
     @cached_property
-    def thin(self) -> WallPoints:
-        """One point every `SPACING_M` of wall: the straightest of each voxel."""
+    def thin(self) -> NDArray[np.int64]:
+        """Rows of one point every `SPACING_M` of wall: the straightest of each voxel."""
         voxel = np.floor(self.positions_m / SPACING_M).astype(np.int64)
         key = (voxel[:, 0] << 32) + voxel[:, 1]
         order = np.lexsort((np.arange(len(key)), -self.linearity, key))
         first = np.ones(len(order), np.bool_)
         first[1:] = np.diff(key[order]) != 0
-        return self.subset(np.sort(order[first]))
+        rows: NDArray[np.int64] = np.sort(order[first])
+        return rows
 
     def subset(self, index: NDArray[np.int64]) -> WallPoints:
         return WallPoints(self.cells_rc[index], self.positions_m[index], self.normals[index], self.linearity[index])
@@ -91,12 +93,30 @@ def _fitted(grid: WorkingGrid, cells: NDArray[np.int32]) -> tuple[NDArray[np.flo
     y, x = offsets[:, 0] * grid.resolution_m, offsets[:, 1] * grid.resolution_m
     moments = occupied @ (weights[:, None] * np.stack([np.ones_like(x), x, y, x * x, y * y, x * y], axis=1)).astype(np.float32)
     towards_free = free @ np.stack([x, y], axis=1).astype(np.float32)
-    centre, normal, linearity = _principal(moments)
+    normal, linearity = _principal(moments)
     flip = np.sign((towards_free * normal).sum(axis=1, keepdims=True))
     normal = (normal * np.where(flip == 0, 1, flip)).astype(np.float32)
-    shift = (centre * normal).sum(axis=1, keepdims=True) * normal
+    shift = _shift(occupied, normal, x, y, weights, grid.resolution_m)[:, None] * normal
     positions = (cells[:, ::-1] + np.float32(0.5)) * np.float32(grid.resolution_m) + shift
     return positions.astype(np.float32), normal, linearity
+
+
+def _shift(
+    occupied: NDArray[np.float32],
+    normal: NDArray[np.float32],
+    x: NDArray[np.floating],
+    y: NDArray[np.floating],
+    weights: NDArray[np.floating],
+    resolution_m: float,
+) -> NDArray[np.float32]:
+    """(N,) how far the local line lies from the cell's centre along the normal: the mean of the cells beside it.
+
+    Cells farther than a cell across are the other side of the wall, or another wall.
+    """
+    across = normal @ np.stack([x, y]).astype(np.float32)
+    near = occupied * (np.abs(across) <= ACROSS_CELLS * resolution_m) * weights.astype(np.float32)
+    shift: NDArray[np.float32] = (near * across).sum(axis=1) / np.maximum(near.sum(axis=1), 1e-6)
+    return shift
 
 
 def _touches_edge(cells: NDArray[np.int32], reach: int, rows: int, cols: int) -> bool:
@@ -115,8 +135,8 @@ def _window(resolution_m: float) -> tuple[NDArray[np.int32], NDArray[np.float64]
     return np.stack([dy[keep], dx[keep]], axis=1).astype(np.int32), 1.0 - 0.6 * d2[keep]
 
 
-def _principal(moments: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Centroid (N, 2), unit normal (N, 2) and linearity (N,) from the moments [1, x, y, xx, yy, xy] of the occupied cells."""
+def _principal(moments: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Unit normal (N, 2) and linearity (N,) from the moments [1, x, y, xx, yy, xy] of the occupied cells."""
     m = np.maximum(moments[:, :1], 1e-6)
     x, y, xx, yy, xy = (moments[:, 1:] / m).T
     cxx, cyy, cxy = xx - x * x, yy - y * y, xy - x * y
@@ -124,7 +144,7 @@ def _principal(moments: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArr
     tangent = 0.5 * np.arctan2(2 * cxy, cxx - cyy)
     linearity = 2 * half / np.maximum(cxx + cyy, 1e-9)
     normal = np.stack([-np.sin(tangent), np.cos(tangent)], axis=1)
-    return np.stack([x, y], axis=1), normal, linearity.astype(np.float32)
+    return normal, linearity.astype(np.float32)
 
 
 def direction_bins(angles_rad: NDArray[np.floating], bins: int) -> NDArray[np.uint8]:

@@ -129,6 +129,6 @@ def _terms(
     """Place, residual, normal and weight of every pair; weight zero where it does not count."""
     e = nx * ex + ny * ey
     keep = (facing > MIN_COSINE) & (ex * ex + ey * ey < (gate_m + 0.1) ** 2) & (np.abs(e) < gate_m)
-    soft = max(2 * SIGMA_M, 0.5 * gate_m)
+    soft = max(2 * SIGMA_M, 0.3 * gate_m)
     w = np.where(keep, 1.0 / (1.0 + (e / soft) ** 2), 0.0).astype(np.float32)
     return (*(v.astype(np.float32) for v in (x, y, e, nx, ny)), w)

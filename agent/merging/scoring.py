@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.features.field import DIRECTION_BINS, FREE_BYTE
+from agent.features.structure import LOOSE
 from agent.features.wall_points import SPACING_M, WallPoints, direction_bins
 from agent.merging.transforms import Poses
 
 AGREE_BINS = 9  # normals within 51 degrees agree: corners and clutter turn normals, walls of a corridor differ by 180
-OPPOSITE_BINS = 23  # beyond 129 degrees: the far side of a thin wall, no evidence either way
+OPPOSITE_BINS = 23  # beyond 129 degrees: perhaps the far side of a thin wall
 _BLOCK = 400_000  # points at a time, so that temporaries stay in cache
 
 
@@ -28,43 +29,71 @@ class Probe:
 
     xy1: NDArray[np.float32]  # (3, P) x, y, 1
     bins: NDArray[np.uint8]  # (P,) direction of the normals
+    kinds: NDArray[np.uint16]  # (P,) what they are part of, shifted to the top two bits
     wall_m: float  # wall that one point stands for
 
     @staticmethod
-    def of(walls: WallPoints, wall_m: float = SPACING_M) -> Probe:
+    def of(walls: WallPoints, kinds: NDArray[np.uint8], wall_m: float = SPACING_M) -> Probe:
         xy1 = np.ones((3, len(walls)), np.float32)
         xy1[:2] = walls.positions_m.T
-        return Probe(xy1, direction_bins(walls.angles_rad, DIRECTION_BINS), wall_m)
+        return Probe(
+            xy1, direction_bins(walls.angles_rad, DIRECTION_BINS), np.left_shift(kinds.astype(np.uint16), np.uint16(14)), wall_m
+        )
 
     @staticmethod
-    def sample(walls: WallPoints, count: int) -> Probe:
-        """About `count` points spread evenly over the map's walls."""
-        if len(walls) <= count:
-            return Probe.of(walls)
-        index = np.linspace(0, len(walls) - 1, count).astype(np.int64)
-        return Probe.of(walls.subset(index), SPACING_M * len(walls) / count)
+    def sample(walls: WallPoints, kinds: NDArray[np.uint8], count: int) -> Probe:
+        """About `count` points spread over the map's walls; loose things only where there is little else."""
+        firm = np.flatnonzero(kinds != LOOSE)
+        rows = firm if len(firm) >= count else np.arange(len(walls))
+        wall_m = SPACING_M * max(1.0, len(rows) / count)
+        if len(rows) > count:
+            rows = rows[np.linspace(0, len(rows) - 1, count).astype(np.int64)]
+        return Probe.of(walls.subset(rows), kinds[rows], wall_m)
 
 
-def worth_table(hit: float, conflict: float, crossing: float) -> NDArray[np.float32]:
-    """(256 * 64,) worth of a point by field byte and direction bin: agreeing, on free space, near but perpendicular."""
+NOTHING, AGREES, CONFLICTS, CROSSES, OPPOSITE = range(5)  # what a field says to a wall point
+
+
+def outcome_table() -> NDArray[np.uint8]:
+    """(256, 64) what field byte and direction bin say together."""
     byte, own = np.arange(256)[:, None], np.arange(DIRECTION_BINS)[None, :]
     apart = np.abs((byte - own + DIRECTION_BINS // 2) % DIRECTION_BINS - DIRECTION_BINS // 2)
-    wall = np.where(apart <= AGREE_BINS, hit, np.where(apart < OPPOSITE_BINS, crossing, 0.0))
-    worth = np.where(byte < DIRECTION_BINS, wall, np.where(byte == FREE_BYTE, conflict, 0.0))
-    return worth.astype(np.float32).ravel()
+    wall = np.where(apart <= AGREE_BINS, AGREES, np.where(apart < OPPOSITE_BINS, CROSSES, OPPOSITE))
+    outcome = np.where(byte < DIRECTION_BINS, wall, np.where(byte == FREE_BYTE, CONFLICTS, NOTHING))
+    return outcome.astype(np.uint8)
 
 
-SEARCH_WORTH = worth_table(hit=1.0, conflict=-1.2, crossing=-0.2)
+def worth_table(by_kind: tuple[tuple[float, float, float, float], ...]) -> NDArray[np.float32]:
+    """(4 * 256 * 64,) worth of a point by kind, field byte and direction bin.
+
+    `by_kind` holds for every kind the worth of agreeing, conflicting, crossing and opposite.
+    """
+    worths = [np.array([0.0, *worth], np.float32) for worth in by_kind]
+    outcome = outcome_table()
+    return np.concatenate([worth[outcome].ravel() for worth in worths])
+
+
+# Rounded from likelihood ratios at true and wrong transforms of the recordings, where the optimum is flat.  Agreement along a
+# long wall says little (a corridor agrees with any corridor), its absence much; the absence of loose things says nothing.
+SEARCH_WORTH = worth_table(
+    (
+        (0.6, -0.1, 0.0, 0.0),  # loose
+        (1.0, -0.8, -0.3, -0.2),  # attached
+        (1.0, -1.2, -0.4, -0.2),  # short
+        (0.8, -1.6, -0.6, -0.2),  # long
+    )
+)
 
 
 def readings(field: NDArray[np.uint8], resolution_m: float, probe: Probe, poses: Poses) -> NDArray[np.uint16]:
-    """(C, P) field byte and direction bin of every point under every transform, as one table index."""
+    """(C, P) kind, field byte and direction bin of every point under every transform, as one table index."""
     x, y = placed(probe.xy1, poses, resolution_m)
     seen = cv2.remap(field, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=255)
     turn = np.rint(poses[:, 2] * (DIRECTION_BINS / math.tau)).astype(np.int64).astype(np.uint8)
     index: NDArray[np.uint16] = seen.astype(np.uint16)
     index <<= 6
     index |= (probe.bins[None, :] + turn[:, None]) & 63
+    index |= probe.kinds[None, :]
     return index
 
 

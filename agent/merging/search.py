@@ -1,70 +1,83 @@
 """The funnel from thousands of candidate transforms to a handful of refined ones, each step dearer and for fewer.
 
-rotations from wall directions -> corners and correlation -> coarse score -> distinct -> refined -> distinct -> refined to the end
+corners and signatures (then correlation) -> coarse score -> distinct -> both ways -> roughly refined -> distinct -> refined
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agent.features.snapshot import MapSnapshot
-from agent.merging.candidates import corner_candidates
-from agent.merging.correlation import Places, correlation_candidates
-from agent.merging.refinement import Side, refined
+from agent.merging.candidates import corner_candidates, signature_candidates
+from agent.merging.correlation import correlation_candidates
+from agent.merging.refinement import refined
 from agent.merging.rotations import rotation_candidates
-from agent.merging.scoring import SEARCH_WORTH, Probe, scores
+from agent.merging.scoring import SEARCH_WORTH, scores
 from agent.merging.transforms import Poses, distinct, inverted, no_poses
-from agent.merging.validation import Witness
+from agent.merging.views import places, probe, side
 
 
 @dataclass(frozen=True, slots=True)
 class Effort:
     """How many candidates each step of the funnel lets through."""
 
-    rotations: int = 6
-    peaks: int = 20  # translations a rotation
-    scored: int = 300
+    rotations: int = 8  # peaks of the wall directions' correlation
+    correlated: int = 0  # of these, how many are searched by Fourier transform, with two neighbours each
+    peaks: int = 20  # translations each of those yields
+    scored: int = 300  # of every source, after the coarse score
     drawn: int = 60  # roughly refined
     kept: int = 20  # refined to the end
 
 
-FIRST_PASS = Effort()
-SECOND_PASS = Effort(rotations=12, peaks=30, scored=600, drawn=150, kept=40)
+FIRST_PASS = Effort()  # corners and signatures: 20 ms for two cached indoor maps
+SECOND_PASS = Effort(correlated=4, drawn=100, kept=30)  # finds what the first missed in 1 pair of 50, and rivals
 
+NEIGHBOUR_RAD = math.radians(1.2)  # peaks err by about this; correlation over a large map does not forgive it
 _ROUGH_GATES_M = (0.8, 0.6, 0.4)
 _LAST_GATES_M = (0.4, 0.3, 0.2, 0.15)
+_FEW, _SOME, _MANY = 120, 250, 500  # points
 
 
-def search(ours: MapSnapshot, theirs: MapSnapshot, effort: Effort = FIRST_PASS) -> tuple[Poses, int]:
-    """The best distinct transforms, refined, and how many were tried."""
-    rotations = rotation_candidates(ours.directions, theirs.directions, effort.rotations)
-    if not len(rotations) or not len(ours.thin_walls) or not len(theirs.thin_walls):
+def search(ours: MapSnapshot, theirs: MapSnapshot, effort: Effort) -> tuple[Poses, int]:
+    """The best distinct transforms, refined (grid frames), and how many were tried."""
+    if not len(ours.thin_walls) or not len(theirs.thin_walls):
         return no_poses(), 0
-    corners = corner_candidates(ours.corners, theirs.corners, rotations)
-    shifts, _ = correlation_candidates(places(ours), places(theirs), rotations, effort.peaks)
-    poses = np.concatenate([corners, shifts])
-    tried = len(poses)
-    poses = poses[distinct(poses, _coarse_scores(ours, theirs, poses), theirs.middle_m, effort.scored)]
-    poses = poses[np.argsort(-_scores(ours, theirs, poses, "coarse"), kind="stable")[: effort.drawn]]
-    poses = refined(side(ours, 120), side(theirs, 120), poses, _ROUGH_GATES_M)
-    poses = poses[distinct(poses, _scores(ours, theirs, poses, "fine"), theirs.middle_m, effort.kept)]
-    return refined(side(ours, 500), side(theirs, 500), poses, _LAST_GATES_M), tried
+    found = list(_sources(ours, theirs, effort))
+    tried = sum(len(poses) for poses in found)
+    poses = np.concatenate([_coarsely_best(ours, theirs, poses, effort.scored) for poses in found])
+    poses = poses[np.argsort(-_both_ways(ours, theirs, poses, "coarse"), kind="stable")[: effort.drawn]]
+    poses = refined(side(ours, _FEW), side(theirs, _FEW), poses, _ROUGH_GATES_M)
+    poses = poses[distinct(poses, _both_ways(ours, theirs, poses, "fine"), theirs.middle_m, effort.kept)]
+    return refined(side(ours, _MANY), side(theirs, _MANY), poses, _LAST_GATES_M), tried
 
 
-def _coarse_scores(ours: MapSnapshot, theirs: MapSnapshot, poses: Poses) -> NDArray[np.float32]:
-    """A few points of the map with less wall, on the other."""
+def _sources(ours: MapSnapshot, theirs: MapSnapshot, effort: Effort) -> Iterator[Poses]:
+    rotations = rotation_candidates(ours.directions, theirs.directions, effort.rotations)
+    yield corner_candidates(ours.corners, theirs.corners, rotations)
+    yield signature_candidates(ours.signatures, theirs.signatures, rotations)
+    if effort.correlated and len(rotations):
+        first = rotations[: effort.correlated]
+        turns = np.concatenate([rotations, first - NEIGHBOUR_RAD, first + NEIGHBOUR_RAD])
+        yield correlation_candidates(places(ours), places(theirs), turns, effort.peaks)
+
+
+def _coarsely_best(ours: MapSnapshot, theirs: MapSnapshot, poses: Poses, limit: int) -> Poses:
+    """By a few points of the map with less wall, on the other."""
     if len(ours.thin_walls) < len(theirs.thin_walls):
-        return _one_way(theirs, ours, inverted(poses), "coarse", 160)
-    return _one_way(ours, theirs, poses, "coarse", 160)
+        score = _one_way(theirs, ours, inverted(poses), "coarse", 160)
+    else:
+        score = _one_way(ours, theirs, poses, "coarse", 160)
+    return poses[distinct(poses, score, theirs.middle_m, limit)]
 
 
-def _scores(ours: MapSnapshot, theirs: MapSnapshot, poses: Poses, field: str) -> NDArray[np.float32]:
-    """Both directions."""
-    there = _one_way(ours, theirs, poses, field, 250)
-    back = _one_way(theirs, ours, inverted(poses), field, 250)
+def _both_ways(ours: MapSnapshot, theirs: MapSnapshot, poses: Poses, field: str) -> NDArray[np.float32]:
+    there = _one_way(ours, theirs, poses, field, _SOME)
+    back = _one_way(theirs, ours, inverted(poses), field, _SOME)
     mean: NDArray[np.float32] = 0.5 * (there + back)
     return mean
 
@@ -72,19 +85,3 @@ def _scores(ours: MapSnapshot, theirs: MapSnapshot, poses: Poses, field: str) ->
 def _one_way(on: MapSnapshot, points: MapSnapshot, poses: Poses, field: str, count: int) -> NDArray[np.float32]:
     image = on.field.fine if field == "fine" else on.field.coarse
     return scores(image, on.field.resolution_m, probe(points, count), poses, SEARCH_WORTH)
-
-
-def probe(snapshot: MapSnapshot, count: int) -> Probe:
-    return snapshot.kept(("probe", count), lambda s: Probe.sample(s.thin_walls, count))
-
-
-def side(snapshot: MapSnapshot, count: int) -> Side:
-    return snapshot.kept(("side", count), lambda s: Side.of(s.thin_walls, s.walls, s.field, count))
-
-
-def places(snapshot: MapSnapshot) -> Places:
-    return snapshot.kept("places", lambda s: Places.of(s.working, s.thin_walls))
-
-
-def witness(snapshot: MapSnapshot) -> Witness:
-    return snapshot.kept("witness", lambda s: Witness(s.thin_walls, Probe.of(s.thin_walls), s.field))

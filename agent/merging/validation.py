@@ -8,38 +8,34 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.features.field import DIRECTION_BINS, FREE_BYTE, MatchField
+from agent.features.field import MatchField
+from agent.features.structure import LOOSE
 from agent.features.wall_points import SPACING_M, WallPoints
 from agent.features.working import WorkingGrid
 from agent.merging.result import MatchFactor
-from agent.merging.scoring import AGREE_BINS, OPPOSITE_BINS, Probe, readings
+from agent.merging.scoring import AGREES, CONFLICTS, CROSSES, Probe, outcome_table, readings, worth_table
 from agent.merging.transforms import Poses, inverted
 
-_NOTHING, _HIT, _CONFLICT, _CROSSING, _OPPOSITE = range(5)
-
-
-def _kinds() -> NDArray[np.uint8]:
-    byte, own = np.arange(256)[:, None], np.arange(DIRECTION_BINS)[None, :]
-    apart = np.abs((byte - own + DIRECTION_BINS // 2) % DIRECTION_BINS - DIRECTION_BINS // 2)
-    wall = np.where(apart <= AGREE_BINS, _HIT, np.where(apart < OPPOSITE_BINS, _CROSSING, _OPPOSITE))
-    kinds = np.where(byte < DIRECTION_BINS, wall, np.where(byte == FREE_BYTE, _CONFLICT, _NOTHING))
-    return kinds.astype(np.uint8).ravel()
-
-
-KINDS = _kinds()
+OUTCOMES = np.tile(outcome_table().ravel(), 4)
+DECISION_WORTH = worth_table(
+    (
+        (0.6, -0.05, 0.0, 0.0),  # loose
+        (1.0, -1.1, -0.7, -0.5),  # attached
+        (1.0, -1.6, -0.9, -0.5),  # short
+        (0.65, -1.9, -1.2, -0.5),  # long
+    )
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
     """One row a transform; metres of wall, the mean of both directions."""
 
-    agreeing_m: NDArray[np.float64]
-    conflicting_m: NDArray[np.float64]
-    crossing_m: NDArray[np.float64]
+    score_m: NDArray[np.float64]  # for less against, weighed by what each point is part of
+    potential_m: NDArray[np.float64]  # for alone
+    agreeing_m: NDArray[np.float64]  # firm wall: everything but loose things
+    against_m: NDArray[np.float64]  # firm wall on the other's free space or across its walls
     observability_m: NDArray[np.float64]  # smallest eigenvalue of the sum of n n' over agreeing wall, the worse direction
-
-    def score(self, conflict_weight: float = 2.0, crossing_weight: float = 0.3) -> NDArray[np.float64]:
-        return self.agreeing_m - conflict_weight * self.conflicting_m - crossing_weight * self.crossing_m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,6 +43,7 @@ class Witness:
     """What judging needs of one map."""
 
     thin: WallPoints
+    kinds: NDArray[np.uint8]
     probe: Probe
     field: MatchField
 
@@ -55,18 +52,20 @@ def evidence(ours: Witness, theirs: Witness, poses: Poses) -> Evidence:
     """For and against every transform."""
     forth = _one_way(theirs, ours, poses)
     back = _one_way(ours, theirs, inverted(poses))
-    agreeing, conflicting, crossing = (0.5 * (forth[k] + back[k]) for k in range(3))
-    return Evidence(agreeing, conflicting, crossing, np.minimum(forth[3], back[3]))
+    score, potential, agreeing, against = (0.5 * (forth[k] + back[k]) for k in range(4))
+    return Evidence(score, potential, agreeing, against, np.minimum(forth[4], back[4]))
 
 
 def _one_way(points: Witness, on: Witness, poses: Poses) -> tuple[NDArray[np.float64], ...]:
-    kinds = KINDS.take(readings(on.field.fine, on.field.resolution_m, points.probe, poses))
-    hit = (kinds == _HIT).astype(np.float32)
-    n = points.thin.normals
-    xx, yy, xy = hit @ (n[:, 0] ** 2), hit @ (n[:, 1] ** 2), hit @ (n[:, 0] * n[:, 1])
+    index = readings(on.field.fine, on.field.resolution_m, points.probe, poses)
+    worth, outcome = DECISION_WORTH.take(index), OUTCOMES.take(index)
+    hit, firm = outcome == AGREES, (points.kinds != LOOSE).astype(np.float32)
+    n, hits = points.thin.normals, hit.astype(np.float32)
+    xx, yy, xy = hits @ (n[:, 0] ** 2), hits @ (n[:, 1] ** 2), hits @ (n[:, 0] * n[:, 1])
     smallest = 0.5 * (xx + yy) - np.hypot(0.5 * (xx - yy), xy)
-    counts = [hit.sum(axis=1), (kinds == _CONFLICT).sum(axis=1), (kinds == _CROSSING).sum(axis=1)]
-    return tuple(np.asarray(v, np.float64) * SPACING_M for v in (*counts, smallest))
+    against = ((outcome == CONFLICTS) | (outcome == CROSSES)).astype(np.float32) @ firm
+    sums = worth.sum(axis=1), (worth * hits).sum(axis=1), hits @ firm, against, smallest
+    return tuple(np.asarray(v, np.float64) * SPACING_M for v in sums)
 
 
 def match_factor(ours: WorkingGrid, theirs: WorkingGrid, pose: NDArray[np.float64]) -> tuple[MatchFactor, float]:

@@ -1,0 +1,66 @@
+"""The verdict on the best transform: for it, against it, and how far ahead of the best other one it is.
+
+Absolute evidence is worth little (two corridors agree over a hundred metres of wall), so the margin over the best distinct
+alternative decides first.  The paper's match factor is a gate: true transforms pass it, and look-alikes often do not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.merging.result import MatchOptions, MatchStatus, Reason
+from agent.merging.transforms import Poses, angle_between, applied
+
+SAME_PLACE_M = 0.8  # two transforms that move the middle of their map less than this, and
+SAME_TURN_RAD = 0.105  # turn it less than 6 degrees, are one hypothesis
+MAX_RIVAL_SHARE = 0.72  # of the best score
+MIN_AGREEING_SHARE = 0.5  # of firm wall that says anything; half is a bar that only vegetation comes near
+MIN_YIELD = 0.15  # score per metre it would be without anything against
+MIN_OBSERVABILITY_M = 2.0
+MIN_AGREEING_M = 8.0
+FINE_FACTOR = 0.90  # match factor at 10 cm below which look-alike corridors lie; coarse cells disagree more at the truth,
+FACTOR_SLOPE = 0.4  # by this a metre of cell
+
+
+@dataclass(frozen=True, slots=True)
+class Grounds:
+    """Every number the verdict rests on; metres of wall, the mean of both directions."""
+
+    score: float
+    rival: float  # best score of a distinct alternative
+    agreeing_m: float  # firm wall
+    against_m: float  # firm wall that conflicts or crosses
+    potential_m: float  # the score were there nothing against it
+    observability_m: float
+    factor: float
+    cell_m: float
+
+    def numbers(self) -> dict[str, float]:
+        return {name: float(getattr(self, name)) for name in self.__slots__}
+
+
+def verdict(grounds: Grounds, options: MatchOptions) -> tuple[MatchStatus, str]:
+    """The answer and its reason."""
+    g = grounds
+    if g.agreeing_m <= MIN_AGREEING_M or g.score <= options.min_margin_m:
+        return MatchStatus.NO, Reason.LITTLE_WALL
+    if g.agreeing_m <= MIN_AGREEING_SHARE * (g.agreeing_m + g.against_m) or g.score <= MIN_YIELD * g.potential_m:
+        return MatchStatus.NO, Reason.CONFLICTS
+    if g.factor < max(options.min_match_factor, FINE_FACTOR - FACTOR_SLOPE * max(0.0, g.cell_m - 0.1)):
+        return MatchStatus.NO, Reason.LOW_MATCH_FACTOR
+    if g.observability_m <= MIN_OBSERVABILITY_M:
+        return MatchStatus.AMBIGUOUS, Reason.UNOBSERVABLE
+    if g.score - g.rival <= options.min_margin_m or g.rival >= MAX_RIVAL_SHARE * g.score:
+        return MatchStatus.AMBIGUOUS, Reason.RIVAL
+    return MatchStatus.MERGED, Reason.MATCHED
+
+
+def rival_score(poses: Poses, scores: NDArray[np.float64], best: int, around_m: NDArray[np.float64]) -> float:
+    """Score of the best transform that means something else; zero when there is none."""
+    place = applied(poses, around_m)
+    apart = np.hypot(*(place - place[best]).T) > SAME_PLACE_M
+    apart |= angle_between(poses[:, 2], float(poses[best, 2])) > SAME_TURN_RAD
+    return max(0.0, float(scores[apart].max())) if apart.any() else 0.0
