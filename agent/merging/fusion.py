@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.merging.errors import FusionError
-from agent.merging.resampling import Lattice, corners_of, lattice_around, resampled
+from agent.merging.resampling import Lattice, lattice_around, outline_of, resampled
 from protocol.geometry import SE2
 from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
@@ -55,7 +55,7 @@ def fuse(maps: Sequence[tuple[OccupancyGrid, SE2]], resolution_m: float | None =
     known = [(grid, T) for grid, T in known if grid.known().any()]
     if not known:
         return _nothing_known(cell_m)
-    lattice = lattice_around(np.concatenate([corners_of(grid, T) for grid, T in known]), cell_m)
+    lattice = lattice_around(np.concatenate([outline_of(grid, T) for grid, T in known]), cell_m)
     _check_size(lattice, [grid for grid, _ in known])
     votes = _Votes.none(lattice, coarsest_m=max(grid.resolution_m for grid, _ in known))
     ranks = sorted({grid.resolution_m for grid, _ in known})
@@ -120,7 +120,7 @@ class _Votes:
 
     def add(self, grid: OccupancyGrid, T_global_map: SE2, rank: int) -> None:
         margin_m = self.tolerance_m + self.lattice.resolution_m
-        part, rows, cols = _window(self.lattice, corners_of(grid, T_global_map), margin_m)
+        part, rows, cols = _window(self.lattice, outline_of(grid, T_global_map), margin_m)
         cells = resampled(grid, T_global_map, part)
         free, wall = cells == FREE, cells == OCCUPIED
         near_wall = _dilated(wall, round(self.tolerance_m / self.lattice.resolution_m))
@@ -158,10 +158,10 @@ def _bounds(mask: NDArray[np.bool_]) -> tuple[slice, slice]:
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
 
 
-def _window(lattice: Lattice, corners_m: NDArray[np.float64], margin_m: float) -> tuple[Lattice, slice, slice]:
-    """The part of the lattice around the corners, as a lattice and as slices of the whole."""
-    low = np.maximum(lattice.cells_at(corners_m.min(axis=0, keepdims=True) - margin_m)[0], 0)
-    high = np.minimum(lattice.cells_at(corners_m.max(axis=0, keepdims=True) + margin_m)[0] + 1, (lattice.height, lattice.width))
+def _window(lattice: Lattice, outline_m: NDArray[np.float64], margin_m: float) -> tuple[Lattice, slice, slice]:
+    """The part of the lattice around the outline, as a lattice and as slices of the whole."""
+    low = np.maximum(lattice.cells_at(outline_m.min(axis=0, keepdims=True) - margin_m)[0], 0)
+    high = np.minimum(lattice.cells_at(outline_m.max(axis=0, keepdims=True) + margin_m)[0] + 1, (lattice.height, lattice.width))
     (row, col), (row_end, col_end) = (map(int, low), map(int, high))
     part = Lattice(lattice.resolution_m, lattice.row0 + row, lattice.col0 + col, row_end - row, col_end - col)
     return part, slice(row, row_end), slice(col, col_end)

@@ -58,10 +58,16 @@ def lattice_around(corners_m: NDArray[np.float64], resolution_m: float) -> Latti
     return Lattice(resolution_m, int(row0), int(col0), int(height), int(width))
 
 
-def corners_of(grid: OccupancyGrid, T_target_map: SE2) -> NDArray[np.float64]:
-    """(4, 2) target-frame corners of the grid's rectangle."""
-    w, h = grid.width * grid.resolution_m, grid.height * grid.resolution_m
-    return (T_target_map @ grid.origin).apply([(0.0, 0.0), (w, 0.0), (w, h), (0.0, h)])
+def outline_of(grid: OccupancyGrid, T_target_map: SE2) -> NDArray[np.float64]:
+    """(N, 2) target-frame corners of the first and last known cell of every row: all that is known lies in their hull.
+
+    A turned map's own rectangle has corners where nothing is known, and would make the target several times too large.
+    """
+    known = grid.known()
+    rows = np.flatnonzero(known.any(axis=1))
+    first, last = known[rows].argmax(axis=1), grid.width - known[rows, ::-1].argmax(axis=1)
+    cells = np.concatenate([np.column_stack([col, row]) for col in (first, last) for row in (rows, rows + 1)])
+    return (T_target_map @ grid.origin).apply(cells * grid.resolution_m)
 
 
 def resampled(grid: OccupancyGrid, T_target_map: SE2, lattice: Lattice) -> NDArray[np.int8]:
@@ -137,27 +143,26 @@ def _carried_walls(source: OccupancyGrid, T_target_grid: SE2, lattice: Lattice) 
     """Target cells that hold the centre of a wall cell, or bridge two touching wall cells that landed apart."""
     motion = _CellMotion.of(T_target_grid, source.resolution_m, lattice.resolution_m, (0, 0), (lattice.col0, lattice.row0))
     walls = np.zeros((lattice.height, lattice.width), np.bool_)
-    wall = source.cells == OCCUPIED
-    _mark(walls, _landed(motion, 2 * np.argwhere(wall) + 1))
-    for dr, dc in _NEIGHBOURS:
-        first = 2 * _first_of_touching_pairs(wall, dr, dc) + 1
-        step = np.array([dr, dc])
+    padded = np.pad(source.cells == OCCUPIED, 1)
+    cells = _true_cells(padded) - 1
+    _mark(walls, _landed(motion, 2 * cells + 1))
+    for step in np.array(_NEIGHBOURS):
+        beside = cells + step + 1
+        first = 2 * cells[padded[beside[:, 0], beside[:, 1]]] + 1
         a, b = _landed(motion, first), _landed(motion, first + 2 * step)
         apart = np.abs(a - b).max(axis=1, initial=0) > 1
         _mark(walls, _landed(motion, first[apart] + step))
     return walls
 
 
+def _true_cells(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """(N, 2) (row, col); ten times faster than numpy's own on sparse masks."""
+    found = cv2.findNonZero(mask.view(np.uint8))
+    return np.zeros((0, 2), np.int64) if found is None else found.reshape(-1, 2)[:, ::-1].astype(np.int64)
+
+
 def _landed(motion: _CellMotion, half_cells_rc: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.stack(motion.at(half_cells_rc[:, 1], half_cells_rc[:, 0]), axis=1)
-
-
-def _first_of_touching_pairs(wall: NDArray[np.bool_], dr: int, dc: int) -> NDArray[np.int64]:
-    """(N, 2) occupied cells whose neighbour at (dr, dc) is occupied too."""
-    h, w = wall.shape
-    here, there = wall[: h - dr, max(0, -dc) : w - max(0, dc)], wall[dr:, max(0, dc) : w - max(0, -dc)]
-    first: NDArray[np.int64] = np.argwhere(here & there) + np.array([0, max(0, -dc)])
-    return first
 
 
 def _mark(mask: NDArray[np.bool_], cells_rc: NDArray[np.int64]) -> None:
