@@ -19,6 +19,7 @@ from hw.port import port_list, user_of
 SERIAL_LINKS = Path("/dev/serial")
 # silent listeners first: asking an unknown device may start something, and a streaming one tells within half a second
 PROBE_URLS = ("wheels", "ld06", "rplidar", "ydlidar", "hokuyo", "xv11", "kobuki", "create2", "arduino", "sick", "roboclaw")
+ANY_GEOMETRY = {"arduino": "?ticks=1000&radius=0.05&track=0.3", "roboclaw": "?ticks=1000&radius=0.05&track=0.3"}  # they know none
 WHEEL_SCHEMES = ("wheels", "kobuki", "create2", "arduino", "roboclaw")
 
 
@@ -68,7 +69,7 @@ def probe(port: str, schemes: tuple[str, ...] = PROBE_URLS, seconds: float = 2.5
 def _try(scheme: str, port: str, seconds: float) -> Answer | None:
     is_wheels = scheme in WHEEL_SCHEMES
     url = f"{scheme}:{port}"
-    device = (open_wheels if is_wheels else open_lidar)(url)
+    device = (open_wheels if is_wheels else open_lidar)(url + ANY_GEOMETRY.get(scheme, ""))
     device.start()
     try:
         for _ in _until(time.monotonic() + seconds):

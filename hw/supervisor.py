@@ -68,6 +68,7 @@ class Device:
         self._last_bytes_s = 0.0
         self._good_baud = 0  # the rate at which the device last ran
         self._attempts = 0  # since then
+        self._next_poll_s = 0.0
         self._is_gone = False  # the port failed: nothing can be written any more
 
     def start(self) -> Device:
@@ -172,7 +173,7 @@ class Device:
         self._port = self._open_port(self._good_baud or driver.bauds[0], driver.open_dtr)
         try:
             self._bring_up(self._port)
-            self._stream(self._port)
+            self._stream()
         finally:
             if not self._is_gone and not self._is_passive:
                 self._quietly(driver.stop())
@@ -210,7 +211,7 @@ class Device:
             n, waited_s = counters.bytes_in - seen, time.monotonic() - begin_s
             if n > PROBE_BYTES or waited_s > (FIRST_READING_S if n else listen_s):
                 self._raise_no_frame(n)
-            self._pump(READ_WAIT_S)
+            self._pump(self._ask_if_due())
 
     def _raise_no_frame(self, n_bytes: int) -> None:
         if n_bytes == 0:
@@ -220,20 +221,14 @@ class Device:
             f"{self._url}: {n_bytes} bytes, no valid frame; is the baud rate {rates}, and is this really that device?"
         )
 
-    def _stream(self, port: Port) -> None:
+    def _stream(self) -> None:
         """Feed the driver until stopped; restart a stalled stream once, then give up the session."""
         now_s = time.monotonic()
         self._running_since_s = self._last_reading_s = self._last_bytes_s = now_s
-        has_run, restarts, next_poll_s = False, 0, now_s
+        has_run, restarts = False, 0
         judge = StreamJudge(self._driver.counters)
         while not self._stopping.is_set():
-            wait_s = READ_WAIT_S
-            if self._driver.poll_period_s is not None:
-                wait_s = min(wait_s, self._driver.poll_period_s)
-                if now_s >= next_poll_s:
-                    port.write(self._driver.poll())
-                    next_poll_s = max(next_poll_s + self._driver.poll_period_s, now_s)
-            n = self._pump(wait_s)
+            n = self._pump(self._ask_if_due())
             now_s = time.monotonic()
             if n:
                 has_run, restarts = True, 0
@@ -242,6 +237,18 @@ class Device:
                 self._restart_stalled(restarts)
                 restarts += 1
                 self._last_reading_s = self._last_bytes_s = now_s = time.monotonic()
+
+    def _ask_if_due(self) -> float:
+        """Poll a device that only answers; how long to wait for what comes."""
+        period_s = self._driver.poll_period_s
+        if period_s is None:
+            return READ_WAIT_S
+        assert self._port is not None
+        now_s = time.monotonic()
+        if now_s >= self._next_poll_s:
+            self._port.write(self._driver.poll())
+            self._next_poll_s = max(self._next_poll_s + period_s, now_s)
+        return min(READ_WAIT_S, max(0.0, self._next_poll_s - now_s))
 
     def _is_stalled(self, now_s: float, has_run: bool) -> bool:
         """No byte for 0.3 s, or bytes but no reading for three periods."""

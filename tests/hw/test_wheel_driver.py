@@ -6,8 +6,10 @@ import pytest
 
 from hw.device import build_driver
 from hw.readings import Odometry
+from hw.supervisor import Device
 from hw.urls import parse_url
 from hw.wheels import FLAG_BOOT, EncoderFrame, InfoFrame, encode
+from tests.harness.talking_port import TalkingPort
 
 URL = "wheels:/dev/ttyACM0?ticks=1000&radius=0.05&track=0.3"
 
@@ -63,3 +65,21 @@ def test_a_board_that_tells_its_geometry_needs_no_options() -> None:
     assert _odometry(driver, _frame(0, 0), 10.0) == [], "what a tick is worth is not known yet"
     samples = _odometry(driver, encode(InfoFrame(1000, 50_000, 300_000, "base")) + _frame(1, 0) + _frame(2, 100), 10.04)
     assert samples[-1].x_m == pytest.approx(0.0314159265)
+
+
+def test_a_base_that_only_answers_is_asked_from_the_first_moment() -> None:
+    ticks = iter(range(0, 10**9, 5))
+
+    def answer(port: TalkingPort, data: bytes) -> None:
+        if data.endswith(b"e\r"):
+            n = next(ticks)
+            port.say(f"{n} {n}\r\n".encode())
+
+    driver = build_driver(parse_url("arduino:/dev/x?ticks=1000&radius=0.05&track=0.3"), "wheels")
+    device = Device("arduino:test", driver, TalkingPort(answer).open).start()
+    try:
+        samples = [device.read(5.0) for _ in range(20)]
+        assert all(isinstance(sample, Odometry) for sample in samples)
+        assert samples[-1].x_m > samples[1].x_m
+    finally:
+        device.stop()
