@@ -42,11 +42,12 @@ from agent.runtime.records import Records
 from agent.runtime.sensing import Readings, device_step
 from agent.runtime.state import StateDirectory
 from agent.runtime.worker import Worker, WorkerReport
-from hw.device import Source, open_lidar, open_wheels
+from hw.device import Source, open_lidar, open_wheels, schemes
 from protocol.geometry import SE2
 
 log = logging.getLogger(__name__)
 
+TURN_PER_SPEED = 2.0  # rad/s a m/s: a wheel base of half a metre turns twice as fast as it drives
 STOP_WITHIN_S = 1.5  # what the workers have to come back; the whole stop stays below 2 s
 
 
@@ -61,7 +62,7 @@ class Node:
         self.state = StateDirectory(state_folder) if state_folder is not None else None
         self.records = Records(state_folder / "records.jsonl" if state_folder is not None else None)
         self.lidar: Source = open_lidar(config.lidar.url)
-        self.wheels: Source | None = open_wheels(config.wheels.url) if config.wheels.url else None
+        self.wheels: Source | None = open_wheels(wheels_url(config)) if config.wheels.url else None
         self.readings = Readings()
         self.map = MapWorker(self._mapper(), self.readings)
         self.merger = MergeWorker(match_options(config))
@@ -83,7 +84,13 @@ class Node:
             *(row(f"pull-small-{i}", self.fleet.small_step, 60.0, "fetches", "pulled messages") for i in (1, 2, 3)),
             row("features", self._features_step, 20.0, "estimates", "own map, for the fleet"),
             row("map", self.map.step, 10.0, "readings", "estimates"),
-            row("lidar", device_step(self.lidar, self.readings), 5.0, "LIDAR device", "readings"),
+            row(
+                "lidar",
+                device_step(self.lidar, self.readings, is_upside_down=self.config.lidar.is_upside_down),
+                5.0,
+                "LIDAR device",
+                "readings",
+            ),
             row("keeper", self.keeper.step, 30.0, "everything, to look", "disk, links"),
         ]
         if self.wheels is not None:
@@ -172,6 +179,17 @@ class Node:
         return [worker.report() for worker in self.workers]
 
 
+def wheels_url(config: Config) -> str:
+    """The base's URL with the geometry that the settings give; what the URL itself says is left alone."""
+    wheels, url = config.wheels, config.wheels.url
+    if url.partition(":")[0].lower() not in schemes("wheels"):
+        return url
+    options = {"ticks": wheels.ticks_per_revolution, "radius": wheels.wheel_radius_m, "track": wheels.track_m}
+    given = {name: value for name, value in options.items() if value} | {"v_max": wheels.max_speed_mps}
+    words = [f"{name}={value:g}" for name, value in given.items() if f"{name}=" not in url.partition("?")[2]]
+    return url + ("&" if "?" in url else "?") + "&".join(words) if words else url
+
+
 def mapping_options(config: Config) -> MappingOptions:
     lidar, mapping = config.lidar, config.mapping
     more: dict[str, Any] = {"matching_range_m": mapping.max_range_m} if mapping.max_range_m > 0.0 else {}
@@ -179,6 +197,7 @@ def mapping_options(config: Config) -> MappingOptions:
         resolution_m=mapping.resolution_m,
         particles=mapping.particles,
         max_speed_m_s=config.wheels.max_speed_mps,
+        max_turn_rad_s=TURN_PER_SPEED * config.wheels.max_speed_mps,
         T_base_laser=SE2(lidar.mount_x_m, lidar.mount_y_m, math.radians(lidar.mount_yaw_deg)),
         **more,
     )

@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Protocol
 
 from hw.readings import LaserScan, Odometry
@@ -67,11 +68,13 @@ class Readings:
             return odometry, scan
 
 
-def device_step(device: ReadingSource, readings: Readings) -> Callable[[], None]:
+def device_step(device: ReadingSource, readings: Readings, *, is_upside_down: bool = False) -> Callable[[], None]:
     """One step of a device's worker: wait a little for a reading and hand it on."""
 
     def step() -> None:
         reading = device.read(READ_TIMEOUT_S)
+        if is_upside_down and isinstance(reading, LaserScan):
+            reading = replace(reading, angles_rad=-reading.angles_rad)
         if reading is not None:
             readings.put(reading)
 
