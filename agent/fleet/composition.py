@@ -253,6 +253,9 @@ class Composition:
             T, ours = member.T_global_map, T_root[member.robot]
             if member.map.frame != self._ledger.frame_of(member.robot):
                 return False
+            peer = self._ledger.peers.get(member.robot)
+            if peer is not None and peer.refused == member.map.digest:
+                return False
             if T.distance_m(ours) > _FOLLOW_M or abs(wrap_angle(T.theta_rad - ours.theta_rad)) > _FOLLOW_RAD:
                 return False
         return True

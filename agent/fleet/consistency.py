@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from protocol.geometry import SE2
 from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
@@ -14,38 +15,49 @@ _MAX_CELLS = 20_000  # of their map that are looked up; more does not change the
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """Cells known to both: as many say the same, as many contradict."""
+    """Cells known to both: as many say the same, as many contradict; and the same of walls alone, which says far more."""
 
     agree: int
     conflict: int
+    walls: int  # wall cells of either map where the other knows something
+    wall_conflict: int  # of these, in free space of the other with no wall of it beside
 
     @property
     def conflict_share(self) -> float:
         total = self.agree + self.conflict
         return self.conflict / total if total else 0.0
 
+    @property
+    def wall_conflict_share(self) -> float:
+        return self.wall_conflict / self.walls if self.walls else 0.0
+
 
 def agreement(ours: OccupancyGrid, theirs: OccupancyGrid, T_ours_theirs: SE2) -> Agreement:
-    """Compare their known cells with ours; a wall one cell beside a wall is no contradiction."""
-    known = np.argwhere(theirs.known())
-    if len(known) > _MAX_CELLS:
-        known = known[:: -(-len(known) // _MAX_CELLS)]
-    if len(known) == 0:
-        return Agreement(0, 0)
-    said = theirs.cells[known[:, 0], known[:, 1]]
-    points_m = T_ours_theirs.apply(theirs.points_of(known))
-    held = ours.values_at(points_m)
-    step = max(ours.resolution_m, theirs.resolution_m)
-    near_wall = np.zeros(len(known), np.bool_)
-    near_free = np.zeros(len(known), np.bool_)
-    for dx, dy in ((step, 0.0), (-step, 0.0), (0.0, step), (0.0, -step)):
-        beside = ours.values_at(points_m + np.array([dx, dy]))
-        near_wall |= beside == OCCUPIED
-        near_free |= beside == FREE
-    both = held != UNKNOWN
-    same = both & (held == said)
-    soft = both & ~same & (((said == OCCUPIED) & near_wall) | ((said == FREE) & near_free))
-    return Agreement(int(np.count_nonzero(same | soft)), int(np.count_nonzero(both & ~same & ~soft)))
+    """Compare two maps; a wall one cell beside a wall is no contradiction, in either direction."""
+    known = _thinned(np.argwhere(theirs.known()))
+    held = ours.values_at(T_ours_theirs.apply(theirs.points_of(known)))
+    both = int(np.count_nonzero(held != UNKNOWN))
+    step_m = max(ours.resolution_m, theirs.resolution_m)
+    seen_a, against_a = _walls_against(theirs, ours, T_ours_theirs, step_m)
+    seen_b, against_b = _walls_against(ours, theirs, T_ours_theirs.inverse(), step_m)
+    conflict = min(against_a + against_b, both)
+    return Agreement(both - conflict, conflict, seen_a + seen_b, against_a + against_b)
+
+
+def _walls_against(walls_of: OccupancyGrid, free_of: OccupancyGrid, T: SE2, step_m: float) -> tuple[int, int]:
+    """(walls of one map where the other knows something, those in its free space and away from its walls)."""
+    points_m = T.apply(walls_of.points_of(_thinned(np.argwhere(walls_of.cells == OCCUPIED))))
+    there = free_of.values_at(points_m)
+    lone = there == FREE
+    for dx in (-step_m, 0.0, step_m):
+        for dy in (-step_m, 0.0, step_m):
+            if (dx or dy) and lone.any():
+                lone &= free_of.values_at(points_m + np.array([dx, dy])) != OCCUPIED
+    return int(np.count_nonzero(there != UNKNOWN)), int(np.count_nonzero(lone))
+
+
+def _thinned(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    return cells[:: max(1, -(-len(cells) // _MAX_CELLS))]
 
 
 def coarsened(grid: OccupancyGrid, resolution_m: float) -> OccupancyGrid:

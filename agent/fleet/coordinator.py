@@ -329,6 +329,8 @@ class Coordinator:
             if said.seq == known.seq and said != known:
                 self._pairs.strike(peer, "equivocation", now_s)
             return
+        if said.other == self.robot:
+            self._pairs.on_proposal(peer, said, now_s)
         peer.statements[said.other] = said
         peer.statements_seq = max(peer.statements_seq, said.seq)
         self._after_statements(peer, [said], now_s)
@@ -357,6 +359,8 @@ class Coordinator:
             self._pairs.strike(peer, "forged map", now_s)
             return
         peer.maps.add(tiles)
+        if peer.held is not None and peer.held.frame != said.map.frame:
+            peer.anchor = None
         is_newest = peer.held is None or peer.held.frame != said.map.frame or said.map.revision > peer.held.revision
         if is_newest:
             peer.hold(said.map, tiles.grid())
@@ -369,24 +373,55 @@ class Coordinator:
         except RemoteProtocolError:
             self._pairs.strike(peer, "forged global map", now_s)
 
-    def _admit(self, peer: Peer) -> None:
-        """Let a member's new cells into the global map, unless they contradict our own: then check the edge first."""
+    def _admit(self, peer: Peer, now_s: float) -> None:
+        """Let a member's new cells into the global map, unless they contradict its own earlier ones, or ours."""
         assert peer.held is not None and peer.grid is not None
         group, own = self._ledger.group, self._ledger.own
-        if pair_key(self.robot, peer.robot) not in self._ledger.live or group is None or peer.robot not in group.T_root:
-            peer.admitted = peer.held
+        if group is None or peer.robot not in group.T_root or own.grid is None or own.version is None:
+            self._accept(peer)
             return
-        assert own.grid is not None and own.version is not None
+        judged = (own.version.digest, peer.held.digest)
         pair = self._pairs.pair(peer.robot)
-        if pair.is_urgent:
+        is_neighbour = pair_key(self.robot, peer.robot) in self._ledger.live
+        is_checked = is_neighbour and pair.checked_digests == judged and pair.failures == 0
+        if is_checked or (not is_neighbour and self._is_vouched_for(peer)):
+            self._accept(peer)
+            return
+        if peer.judged == judged:
+            return  # contradicts; waits for a check
+        peer.judged = judged
+        moved = agreement(peer.anchor, peer.grid, SE2.identity()) if peer.anchor is not None else None
+        if moved is not None and moved.walls >= 40 and moved.wall_conflict_share > self.options.broken_word_share:
+            self._pairs.strike(peer, "map broke its word", now_s)
+            self._lay_out(now_s)
+            return
+        is_steady = moved is None or moved.wall_conflict_share <= self.options.max_self_conflict
+        if not is_neighbour:
+            if is_steady:
+                self._accept(peer)
             return
         T_ours_theirs = group.T_root[self.robot].inverse() @ group.T_root[peer.robot]
-        is_checked = pair.checked_digests == (own.version.digest, peer.held.digest) and pair.failures == 0
-        limit = pair.conflict_share + self.options.max_new_conflict
-        if is_checked or agreement(own.grid, peer.grid, T_ours_theirs).conflict_share <= limit:
-            peer.admitted = peer.held
+        against = agreement(own.grid, peer.grid, T_ours_theirs).wall_conflict_share
+        if is_steady and against <= max(pair.conflict_share, 0.0) + self.options.max_new_conflict:
+            self._accept(peer)
         else:
-            pair.is_urgent = True
+            peer.refused, pair.is_urgent = peer.held.digest, True
+
+    def _accept(self, peer: Peer) -> None:
+        peer.admitted, peer.refused = peer.held, b""
+        group = self._ledger.group
+        if peer.anchor is None or group is None or self._is_vouched_for(peer):
+            peer.anchor = peer.grid
+
+    def _is_vouched_for(self, peer: Peer) -> bool:
+        """Whether a live edge was checked on the cells we hold, or on later ones."""
+        assert peer.held is not None
+        for key, evidence in self._ledger.live.items():
+            if peer.robot in key:
+                cited = evidence.map_a if peer.robot == evidence.robot_a else evidence.map_b
+                if cited.frame == peer.held.frame and cited.revision >= peer.held.revision:
+                    return True
+        return False
 
     def _check_frame(self, peer: Peer, before: MapVersion | None, now_s: float) -> None:
         frame = peer.map.frame if peer.map else None
@@ -509,7 +544,7 @@ class Coordinator:
         for peer in turn:
             self._pull_words(peer, now_s)
             if peer.held != peer.admitted:
-                self._admit(peer)
+                self._admit(peer, now_s)
         self._pairs.next_job(turn, now_s)
         self._pull_maps(turn, now_s)
 

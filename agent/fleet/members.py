@@ -44,6 +44,9 @@ class Peer:
     grid: OccupancyGrid | None = None  # the cells of `held`
     area_m2: float = 0.0  # known area of `held`
     admitted: MapVersion | None = None  # the newest version that may enter the global map
+    anchor: OccupancyGrid | None = None  # its cells when an edge was last checked: what newer cells must not contradict
+    refused: bytes = b""  # a version of its cells that may not enter the global map
+    judged: tuple[bytes, bytes] = (b"", b"")  # (ours, theirs) that led to that
     maps: History = field(default_factory=lambda: History(_KEPT_PEER_MAPS))
     versions: dict[bytes, MapVersion] = field(default_factory=dict)  # of everything in `maps`
     ghosts: dict[int, Ghost] = field(default_factory=dict)

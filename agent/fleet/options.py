@@ -35,7 +35,10 @@ class FleetOptions:
     min_match_factor: float = 0.85  # the paper's; equation (3)
     same_transform_m: float = 0.5  # two transforms of one pair are the same within these
     same_transform_rad: float = 0.06
-    max_new_conflict: float = 0.02  # a new revision of a member may disagree with our own cells by this much more than before
+    max_new_conflict: float = 0.10  # share of walls by which a member may contradict us more than when it joined
+    max_self_conflict: float = 0.15  # share of walls a member may move unchecked; more, and its edges are checked first
+    broken_word_share: float = 0.35  # moved walls that no mapping explains: a redrawn map has to be a new frame
+    renew_period_s: float = 15.0  # a live edge whose maps changed is checked and proposed anew at least this often
     quarantine_strikes: int = 3  # provable untruths before a peer's statements are no longer heard
     quarantine_s: float = 300.0
     seed: int = 0  # of the jitter

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from agent.fleet.consistency import agreement
 from agent.fleet.effects import Match, MatchKind
 from agent.fleet.ledger import Ledger, pair_key, supported
 from agent.fleet.members import Peer
@@ -34,6 +35,8 @@ class Purpose(enum.Enum):
     PROPOSAL = "proposal"  # the other side says so
     RECHECK = "recheck"  # an edge lives; does it still?
 
+
+_LONGEST_DOUBT_S = 60.0  # between two checks of proposals of a peer whose last ones were refused
 
 _URGENCY = {
     Purpose.PROPOSAL: 0,
@@ -71,11 +74,14 @@ class Pair:
     loop: Attempt | None = None
     checked: Attempt | None = None
     checked_digests: tuple[bytes, bytes] = (b"", b"")
-    conflict_share: float = 0.0  # of the cells, when the edge was last found good
+    conflict_share: float = -1.0  # of the walls, when the edge was first found good; negative: not yet
     failures: int = 0  # checks of the live edge that failed, in a row
     is_urgent: bool = False  # the newest cells contradict the edge
+    renewed_s: float = -1e18
     hint: SE2 | None = None  # T_ours_theirs that held before a frame was drawn anew
-    refused: bytes = NO_DIGEST  # evidence of theirs that we checked and refused
+    refused: Evidence | None = None  # evidence of theirs that we checked and did not find true
+    refusals: int = 0  # in a row
+    refused_s: float = 0.0
     wants_coarse: bool = False
     wants_fine: bool = False
 
@@ -134,7 +140,7 @@ class PairWork:
         ledger = self._ledger
         said = peer.statements.get(ledger.robot)
         mine = ledger.mine.get(peer.robot)
-        if said is not None and self._must_verify(pair, said, mine):
+        if said is not None and self._must_verify(pair, said, mine, now_s):
             theirs = said.evidence.map_a if peer.robot == said.evidence.robot_a else said.evidence.map_b
             if not _holds(peer, theirs):
                 pair.wants_fine = True
@@ -194,11 +200,13 @@ class PairWork:
             return None
         return Purpose.COARSE, None, None
 
-    def _must_verify(self, pair: Pair, said: Statement, mine: Statement | None) -> bool:
+    def _must_verify(self, pair: Pair, said: Statement, mine: Statement | None, now_s: float) -> bool:
         """Whether they propose something we have not judged, and that outranks what we propose ourselves."""
         if said.stance is not Stance.PROPOSE or not self._ledger.is_current(said.evidence):
             return False
-        if said.evidence.id() == pair.refused or (mine is not None and said.evidence.id() in supported(mine)):
+        if said.evidence == pair.refused or (mine is not None and said.evidence.id() in supported(mine)):
+            return False
+        if pair.refused is not None and now_s < pair.refused_s + min(2.0**pair.refusals, _LONGEST_DOUBT_S):
             return False
         if mine is None or mine.stance is not Stance.PROPOSE or mine.evidence.id() in supported(said):
             return True
@@ -218,14 +226,15 @@ class PairWork:
         own = self._ledger.own.version
         assert own is not None
         options = self._ledger.options
+        waited_s = now_s - pair.checked.at_s if pair.checked is not None else 0.0
         if pair.failures > 0 and pair.checked is not None:  # once more, to be sure
-            return now_s - pair.checked.at_s >= options.reverify_period_s
+            return waited_s >= options.reverify_period_s
         if peer.held is None or (own.digest, peer.held.digest) == pair.checked_digests:
             return False
         if pair.is_urgent or pair.checked is None:
             return True
         has_grown = self._area_m2(peer) >= pair.checked.area_m2 * (1.0 + options.reverify_growth)
-        return has_grown and now_s - pair.checked.at_s >= options.reverify_period_s
+        return waited_s >= (options.reverify_period_s if has_grown else options.renew_period_s)
 
     def _is_due(self, attempt: Attempt | None, area_m2: float, theirs: MapVersion | None, now_s: float) -> bool:
         """Whether there is more map than last time; or any other map at all, after a long while."""
@@ -313,14 +322,13 @@ class PairWork:
         live = self._ledger.live.get(pair_key(self._ledger.robot, pair.peer))
         holds = live.id() if live is not None else NO_DIGEST
         if result.accepted and self._is_same(result.T_ours_theirs, running.job.T_ours_theirs):
+            pair.refused, pair.refusals = None, 0
             self._found_good(pair, peer, running, result, now_s)
             self.say(pair.peer, Stance.ACK, evidence, holds, result.reason)
             return
-        pair.refused = evidence.id()
+        pair.refused, pair.refusals, pair.refused_s = evidence, pair.refusals + 1, now_s
         pair.phase = "no"
         self.say(pair.peer, Stance.REJECT, evidence, holds, result.reason)
-        if result.factor.value < 0.7 and result.factor.disagree > 50:
-            self.strike(peer, "false proposal", now_s)
 
     def _on_rechecked(self, pair: Pair, peer: Peer, running: _Running, result: MergeResult, now_s: float) -> None:
         live = self._ledger.live.get(pair_key(self._ledger.robot, pair.peer))
@@ -329,9 +337,10 @@ class PairWork:
         assert running.job.T_ours_theirs is not None
         if result.status is not MatchStatus.NO:
             self._found_good(pair, peer, running, result, now_s)
-            if result.accepted and self._ledger.robot < pair.peer and self._is_news(live, running, result):
+            if result.accepted and self._ledger.robot < pair.peer and self._is_news(pair, live, running, result, now_s):
                 evidence = self._evidence(running, result)
                 if evidence is not None:
+                    pair.renewed_s = now_s
                     self.say(pair.peer, Stance.PROPOSE, evidence, live.id(), result.reason)
             return
         pair.failures += 1
@@ -341,7 +350,7 @@ class PairWork:
         if is_plain or pair.failures >= 2:
             was_urgent = pair.is_urgent
             self.withdraw(pair.peer, result.reason, now_s)
-            if was_urgent and is_plain:
+            if was_urgent:
                 self.strike(peer, "map turned false", now_s)
 
     def _found_good(self, pair: Pair, peer: Peer, running: _Running, result: MergeResult, now_s: float) -> None:
@@ -349,16 +358,26 @@ class PairWork:
         pair.failures, pair.is_urgent, pair.phase, pair.hint = 0, False, "merged", None
         pair.checked = Attempt(now_s, running.area_m2)
         pair.checked_digests = (running.ours.digest, running.theirs.digest)
-        total = result.factor.agree + result.factor.disagree
-        pair.conflict_share = result.factor.disagree / total if total else 0.0
-        peer.admitted = running.theirs
+        T = result.T_ours_theirs
+        if (
+            running.job.T_ours_theirs is not None
+            and T is not None
+            and (pair.conflict_share < 0.0 or running.purpose is Purpose.PROPOSAL)
+        ):
+            share = agreement(running.job.ours, running.job.theirs, T).wall_conflict_share
+            pair.conflict_share = share if pair.conflict_share < 0.0 else min(share, pair.conflict_share)
 
-    def _is_news(self, live: Evidence, running: _Running, result: MergeResult) -> bool:
+    def _is_news(self, pair: Pair, live: Evidence, running: _Running, result: MergeResult, now_s: float) -> bool:
         """Whether the edge is worth proposing anew with better figures."""
         T, T_old = result.T_ours_theirs, running.job.T_ours_theirs
         assert T is not None and T_old is not None
         has_moved = T.distance_m(T_old) > 0.04 or abs(wrap_angle(T.theta_rad - T_old.theta_rad)) > 0.005
-        return has_moved or result.overlap_m2 > live.overlap_m2 * (1.0 + self._ledger.options.renew_growth)
+        cited = {live.map_a.digest, live.map_b.digest}
+        is_old = (
+            cited != {running.ours.digest, running.theirs.digest}
+            and now_s - pair.renewed_s >= self._ledger.options.renew_period_s
+        )
+        return has_moved or is_old or result.overlap_m2 > live.overlap_m2 * (1.0 + self._ledger.options.renew_growth)
 
     def _is_same(self, T: SE2 | None, other: SE2) -> bool:
         options = self._ledger.options
@@ -392,6 +411,15 @@ class PairWork:
         pair.search = pair.loop = Attempt(now_s, area_m2)
         self.say(other, Stance.WITHDRAW, mine.evidence, NO_DIGEST, reason)
         self._ledger.note("withdrawn", peer=other, reason=reason)
+
+    def on_proposal(self, peer: Peer, said: Statement, now_s: float) -> None:
+        """An honest robot does not propose one transform, and then quite another, on the very same maps."""
+        before = peer.statements.get(self._ledger.robot)
+        if before is None or before.stance is not Stance.PROPOSE or said.stance is not Stance.PROPOSE:
+            return
+        old, new = before.evidence, said.evidence
+        if (old.map_a, old.map_b) == (new.map_a, new.map_b) and not self._is_same(old.T_a_b, new.T_a_b):
+            self.strike(peer, "false proposal", now_s)
 
     def on_said(self, peer: Peer, now_s: float) -> None:
         """The other side spoke about us: answer a withdrawal, take note of a refusal."""

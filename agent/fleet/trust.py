@@ -11,8 +11,9 @@ STRIKES = {
     "forged map": 1.0,  # cells that are not what they were announced to be
     "forged global map": 1.0,
     "equivocation": 3.0,  # two different statements under one number: nobody says that by accident
-    "false proposal": 1.0,  # evidence that our own map contradicts
+    "false proposal": 0.5,  # another transform on the very maps on which one was refused already
     "map turned false": 1.5,  # a map that fitted begins to contradict ours
+    "map broke its word": 3.0,  # its walls are elsewhere than they were, and it calls that the same frame
 }
 
 

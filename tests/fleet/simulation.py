@@ -121,6 +121,7 @@ class Node:
     explorer: Explorer | None
     options: FleetOptions
     coordinator: Coordinator | None = None
+    tap: Tap | None = None
     life: int = 0
     clock_offset_s: float = 0.0
     global_map: GlobalMap | None = None
@@ -133,6 +134,21 @@ class Node:
     @property
     def is_up(self) -> bool:
         return self.coordinator is not None
+
+
+class Tap:
+    """Sits in a robot's network socket: a hostile robot is an honest one whose words are changed on the way out."""
+
+    def say(self, fleet: Fleet, node: Node, message: Message, to: str) -> list[bytes]:
+        """What really goes to one receiver."""
+        return [encode(message)]
+
+    def answer(self, fleet: Fleet, node: Node, key: str, data: bytes | None) -> bytes | None:
+        """What really is answered to a query."""
+        return data
+
+    def every_second(self, fleet: Fleet, node: Node) -> None:
+        """Mischief without an occasion."""
 
 
 Judge = Callable[["Fleet", Node, Match], MergeResult]
@@ -230,20 +246,34 @@ class Fleet:
         node.sent[kind] += len(data)
         node.messages[kind] += 1
         for other in self.nodes.values():
-            if other is not node and self.connects(node.name, other.name):
-                for _ in range(1 + (self.rng.random() < self.link.duplicates)):
-                    if self.rng.random() >= self.link.loss:
-                        self.at(
-                            self.rng.uniform(*self.link.delay_s),
-                            lambda o=other, life=other.life: self._deliver(o, life, data, message),
-                        )
+            if other is node or not self.connects(node.name, other.name):
+                continue
+            if node.tap is not None:
+                for forged in node.tap.say(self, node, message, other.robot):
+                    self.transmit(node, other, forged, None)
+            else:
+                self.transmit(node, other, data, message)
 
-    def _deliver(self, node: Node, life: int, data: bytes, message: Message) -> None:
+    def transmit(self, sender: Node, other: Node, data: bytes, message: Message | None) -> None:
+        """One datagram on one link."""
+        life = other.life
+        for _ in range(1 + (self.rng.random() < self.link.duplicates)):
+            if self.rng.random() >= self.link.loss:
+                self.at(self.rng.uniform(*self.link.delay_s), lambda: self._deliver(sender, other, life, data, message))
+
+    def _deliver(self, sender: Node, node: Node, life: int, data: bytes, message: Message | None) -> None:
         if node.coordinator is None or node.life != life:
             return
         node.received_bytes += len(data)
-        said = decode(data) if self.is_encoded else message
-        self.carry_out(node, node.coordinator.on_message(said, self.local_s(node)))
+        if message is None or self.is_encoded:
+            try:
+                message = decode(data)
+                if message.robot != sender.robot:
+                    raise RemoteProtocolError("a message in another's name")
+            except RemoteProtocolError as error:
+                self.carry_out(node, node.coordinator.on_garbage(sender.robot, str(error), self.local_s(node)))
+                return
+        self.carry_out(node, node.coordinator.on_message(message, self.local_s(node)))
 
     def _fetch(self, node: Node, fetch: Fetch) -> None:
         life, delay_s = node.life, 2 * self.rng.uniform(*self.link.delay_s)
@@ -265,7 +295,7 @@ class Fleet:
         assert peer.coordinator is not None
         if self.rng.random() < self.link.loss:
             return None
-        data = peer.coordinator.register(fetch.key)
+        data = self._ask(peer, fetch.key)
         if data is None:
             return None
         try:
@@ -273,7 +303,7 @@ class Fleet:
             if isinstance(message, Manifest):
                 parts = []
                 for i in range(message.chunks):
-                    piece = peer.coordinator.register(chunk_register(message.digest, i))
+                    piece = self._ask(peer, chunk_register(message.digest, i))
                     chunk = decode(piece) if piece else None
                     if not isinstance(chunk, Chunk):
                         return None
@@ -286,6 +316,11 @@ class Fleet:
         peer.sent[type(message).__name__] += len(data)
         peer.messages[type(message).__name__] += 1
         return message
+
+    def _ask(self, peer: Node, key: str) -> bytes | None:
+        assert peer.coordinator is not None
+        data = peer.coordinator.register(key)
+        return data if peer.tap is None else peer.tap.answer(self, peer, key, data)
 
     def _match(self, node: Node, job: Match) -> None:
         life = node.life

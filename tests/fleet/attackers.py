@@ -1,0 +1,243 @@
+"""Twelve ways to lie to a fleet: each is an honest robot until `from_s`, and then this."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from protocol.codec import decode, encode
+from protocol.geometry import SE2
+from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from protocol.messages import Beat, FineTiles, GlobalMeta, Message, Stance, Statement
+from protocol.tiles import TileDelta
+from tests.fleet.simulation import Explorer, Fleet, Node, Tap
+
+
+class Liar(Explorer):
+    """An explorer whose map is changed before it is shown."""
+
+    change: Callable[[OccupancyGrid], OccupancyGrid] | None = None
+
+    @property
+    def grid(self) -> OccupancyGrid:
+        honest = self._drawn()
+        return honest if self.change is None else self.change(honest)
+
+    @staticmethod
+    def like(explorer: Explorer) -> Liar:
+        return Liar(explorer.world, explorer.T_world_map, explorer.seen, explorer.T_world_robot)
+
+
+class Attack:
+    """Base: `begin` is called once the fleet has merged, `every_second` after that."""
+
+    is_detectable = True  # somebody honest can prove that it lies
+    starts_merged = True
+
+    def begin(self, fleet: Fleet, node: Node) -> None:
+        """Turn bad."""
+
+    def every_second(self, fleet: Fleet, node: Node, age_s: float) -> None:
+        """Go on being bad."""
+
+
+class _MapAttack(Attack):
+    def change(self, grid: OccupancyGrid, age_s: float) -> OccupancyGrid:
+        raise NotImplementedError
+
+    def begin(self, fleet: Fleet, node: Node) -> None:
+        self.every_second(fleet, node, 0.0)
+
+    def every_second(self, fleet: Fleet, node: Node, age_s: float) -> None:
+        liar = node.explorer
+        assert isinstance(liar, Liar)
+        liar.change = lambda grid: self.change(grid, age_s)
+        fleet.share_map(node)
+
+
+class ShiftedMap(_MapAttack):
+    """The whole map jumps by three metres."""
+
+    def change(self, grid: OccupancyGrid, age_s: float) -> OccupancyGrid:
+        return replace(grid, origin=grid.origin @ SE2(3.0, -3.0, 0.0))
+
+
+class MirroredMap(_MapAttack):
+    """Left is right."""
+
+    def change(self, grid: OccupancyGrid, age_s: float) -> OccupancyGrid:
+        return replace(grid, cells=np.ascontiguousarray(grid.cells[:, ::-1]))
+
+
+class AllFree(_MapAttack):
+    """There are no walls anywhere."""
+
+    def change(self, grid: OccupancyGrid, age_s: float) -> OccupancyGrid:
+        return replace(grid, cells=np.full_like(grid.cells, FREE))
+
+
+class AllOccupied(_MapAttack):
+    """There are only walls."""
+
+    def change(self, grid: OccupancyGrid, age_s: float) -> OccupancyGrid:
+        return replace(grid, cells=np.full_like(grid.cells, OCCUPIED))
+
+
+class DriftingMap(_MapAttack):
+    """The map creeps away, ten centimetres a second."""
+
+    def change(self, grid: OccupancyGrid, age_s: float) -> OccupancyGrid:
+        steps = int(0.1 * age_s / grid.resolution_m)
+        return replace(grid, cells=np.roll(grid.cells, steps, axis=1))
+
+
+class InventedWalls(_MapAttack):
+    """The true map with more and more walls through free space."""
+
+    is_detectable = False  # each step is as small as honest maps differ
+
+    def change(self, grid: OccupancyGrid, age_s: float) -> OccupancyGrid:
+        cells = grid.cells.copy()
+        rng = np.random.default_rng(5)
+        free = np.argwhere(cells == FREE)
+        chosen = free[rng.permutation(len(free))[: int(len(free) * min(0.01 * age_s, 0.4))]]
+        cells[chosen[:, 0], chosen[:, 1]] = OCCUPIED
+        return replace(grid, cells=cells)
+
+
+class ErasedWalls(_MapAttack):
+    """The true map with its walls vanishing one by one."""
+
+    is_detectable = False
+
+    def change(self, grid: OccupancyGrid, age_s: float) -> OccupancyGrid:
+        cells = grid.cells.copy()
+        walls = np.argwhere(cells == OCCUPIED)
+        chosen = walls[np.random.default_rng(6).permutation(len(walls))[: int(len(walls) * min(0.03 * age_s, 1.0))]]
+        cells[chosen[:, 0], chosen[:, 1]] = FREE
+        return replace(grid, cells=cells)
+
+
+class _WordAttack(Attack, Tap):
+    """Changes words, not maps."""
+
+    def begin(self, fleet: Fleet, node: Node) -> None:
+        node.tap = self
+
+    # `Tap.every_second` and `Attack.every_second` differ in arguments; the campaign calls the latter.
+
+
+class Equivocation(_WordAttack):
+    """Tells every peer another transform under the same number."""
+
+    def say(self, fleet: Fleet, node: Node, message: Message, to: str) -> list[bytes]:
+        if isinstance(message, Statement):
+            turn = SE2(0.3 * (len(to) + ord(to[-1]) % 7), 0.1, 0.02)
+            message = replace(message, evidence=replace(message.evidence, T_a_b=message.evidence.T_a_b @ turn))
+        return [encode(message)]
+
+    def every_second(self, fleet: Fleet, node: Node, age_s: float) -> None:  # type: ignore[override]
+        assert node.coordinator is not None
+        for statement in list(node.coordinator._ledger.mine.values()):
+            fleet.publish(node, statement)
+
+
+class ProposalSpam(_WordAttack):
+    """Proposes random transforms to everybody, ten a second."""
+
+    def every_second(self, fleet: Fleet, node: Node, age_s: float) -> None:  # type: ignore[override]
+        coordinator = node.coordinator
+        assert coordinator is not None
+        for statement in list(coordinator._ledger.mine.values()):
+            for _ in range(10):
+                coordinator._ledger.seq += 1
+                T = SE2(fleet.rng.uniform(-20, 20), fleet.rng.uniform(-20, 20), fleet.rng.uniform(-math.pi, math.pi))
+                evidence = replace(statement.evidence, T_a_b=T, proposer=node.robot, agree=10**6, disagree=0)
+                lie = Statement(node.robot, coordinator.boot, coordinator._ledger.seq, statement.other, Stance.PROPOSE, evidence)
+                fleet.publish(node, lie)
+
+
+class ForgedTiles(_WordAttack):
+    """Announces one map and hands out another."""
+
+    def answer(self, fleet: Fleet, node: Node, key: str, data: bytes | None) -> bytes | None:
+        if data is None or not key.startswith("map/fine"):
+            return data
+        message = decode(data)
+        if not isinstance(message, FineTiles):
+            return data
+        lie = bytes(b ^ 0x55 for b in message.delta.digest)
+        delta: TileDelta = replace(message.delta, digest=lie)
+        return encode(replace(message, delta=delta, map=replace(message.map, digest=lie)))
+
+    def every_second(self, fleet: Fleet, node: Node, age_s: float) -> None:  # type: ignore[override]
+        liar = node.explorer
+        assert isinstance(liar, Liar)
+        flip = int(age_s) % 2
+        liar.change = lambda grid: replace(
+            grid, cells=np.where(np.eye(*grid.cells.shape, k=flip) > 0, UNKNOWN, grid.cells).astype(np.int8)
+        )
+        fleet.share_map(node)
+
+
+class Garbage(_WordAttack):
+    """Noise on its own keys, a hundred a second, and messages in the names of others."""
+
+    def every_second(self, fleet: Fleet, node: Node, age_s: float) -> None:  # type: ignore[override]
+        for other in fleet.nodes.values():
+            if other is not node:
+                for _ in range(100):
+                    fleet.transmit(node, other, fleet.rng.randbytes(60), None)
+
+
+class FalseRecipes(_WordAttack):
+    """As composer: recipes that misplace the members."""
+
+    is_detectable = False  # nobody follows, so nobody needs to prove it
+
+    def say(self, fleet: Fleet, node: Node, message: Message, to: str) -> list[bytes]:
+        if isinstance(message, GlobalMeta):
+            moved = tuple(
+                replace(m, T_global_map=m.T_global_map @ SE2(2.0, 1.0, 0.1)) if m.robot != message.root else m
+                for m in message.members
+            )
+            message = replace(message, members=moved, digest=bytes(16))
+        return [encode(message)]
+
+    def every_second(self, fleet: Fleet, node: Node, age_s: float) -> None:  # type: ignore[override]
+        assert node.coordinator is not None
+        meta = node.coordinator._composition.meta
+        if meta is not None:
+            node.coordinator._composition.meta = replace(meta, seq=meta.seq + 1)
+            fleet.publish(node, replace(meta, seq=meta.seq + 1))
+
+
+class Reincarnation(_WordAttack):
+    """Claims a new life with every beat."""
+
+    is_detectable = False  # a robot that keeps crashing looks the same
+
+    def say(self, fleet: Fleet, node: Node, message: Message, to: str) -> list[bytes]:
+        if isinstance(message, Beat):
+            message = replace(message, boot=fleet.rng.getrandbits(64))
+        return [encode(message)]
+
+
+ATTACKS: dict[str, type[Attack]] = {
+    "shifted map": ShiftedMap,
+    "mirrored map": MirroredMap,
+    "all free": AllFree,
+    "all occupied": AllOccupied,
+    "drifting map": DriftingMap,
+    "invented walls": InventedWalls,
+    "erased walls": ErasedWalls,
+    "equivocation": Equivocation,
+    "proposal spam": ProposalSpam,
+    "forged tiles": ForgedTiles,
+    "garbage": Garbage,
+    "false recipes": FalseRecipes,
+    "reincarnation": Reincarnation,
+}
