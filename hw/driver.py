@@ -94,6 +94,7 @@ class Driver(Protocol):
     counters: Counters
     identity: Identity
     period_s: float  # usual time from one reading to the next
+    gather_s: float  # bytes are fetched in portions of this long: waking for each frame costs more than decoding it
     open_dtr: bool | None  # level of DTR while opening; None: as the system does
     poll_period_s: float | None  # a device that only answers is asked this often with `poll()`
 
@@ -120,6 +121,7 @@ class DriverBase:
     counters: Counters = field(default_factory=Counters)
     identity: Identity = field(default_factory=Identity)
     period_s: float = 0.1
+    gather_s: float = 0.02  # at 100 kB/s 2 kB of the kernel's 4
     open_dtr: bool | None = None
     poll_period_s: float | None = None
     baud: int = 115200

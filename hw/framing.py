@@ -248,3 +248,9 @@ def _count_outside(candidates: NDArray[np.int64], starts: NDArray[np.int64], len
     before = np.searchsorted(starts, candidates, side="right") - 1
     is_inside = (before >= 0) & (candidates - starts[np.maximum(before, 0)] < length)
     return int(np.count_nonzero(~is_inside))
+
+
+def median(values: NDArray[np.float64]) -> float:
+    """The upper median, without the cost of `np.median`."""
+    middle = len(values) // 2
+    return float(np.partition(values, middle)[middle])

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hw.clock import DeviceClock
-from hw.framing import Bytes, FixedFrames, Frames
+from hw.framing import Bytes, FixedFrames, Frames, median
 from hw.scan_assembler import Beams
 from hw.spinning import FixedFrameLidar, carried
 
@@ -193,7 +193,7 @@ class Ld06(FixedFrameLidar):
         frame_s = span_cdeg / 100.0 / np.maximum(speed_dps, 1.0)
         can_be = (speed_dps > LEAST_DPS) & (speed_dps < MOST_DPS) & (frame_s > 0) & (frame_s < MOST_FRAME_S)
         if can_be.any():
-            now_s = float(np.median(frame_s[can_be]))
+            now_s = median(frame_s[can_be])
             has_changed = can_be.sum() >= 8 and abs(now_s - self._frame_s) > 0.1 * self._frame_s
             self._frame_s = now_s if has_changed or not self._frame_s else 0.9 * self._frame_s + 0.1 * now_s
         tolerance = STRICT_SPAN if self._is_strict else LOOSE_SPAN

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hw.framing import median
 from hw.readings import LaserScan
 
 FULL_COVERAGE = 0.95  # issue D: below, a scan is partial and never clears free space
@@ -174,7 +175,7 @@ def coverage_of(turn_deg: Floats) -> float:
     ordered = np.sort(turn_deg)
     gaps = _turned(ordered, -1) - ordered
     gaps[-1] += 360.0
-    usual = float(np.partition(gaps, len(gaps) // 2)[len(gaps) // 2])  # the median, without its overhead
+    usual = median(gaps)
     long = gaps[gaps > 2.0 * max(usual, 0.05)]
     return 1.0 - float(long.sum() - usual * len(long)) / 360.0 if len(long) else 1.0
 

@@ -28,7 +28,6 @@ from hw.readings import LaserScan, Odometry
 FIRST_BACK_OFF_S, LAST_BACK_OFF_S = 0.05, 2.0  # a replugged cable is back within a second; a missing one costs nothing
 SILENT_BACK_OFF_S = 0.4  # the port is there, the device says nothing: it may speak again any moment
 READ_WAIT_S = 0.05
-GATHER_S = 0.01  # bytes are fetched in portions: at 375 packets a second, waking for each costs more than decoding it
 MIN_STALL_S, STALL_PERIODS = 0.3, 3.0  # HARDWARE.md: noticed within half a second
 PROBE_S = 0.6  # how long a rate is listened to before the next one is tried
 PROBE_BYTES = 4096  # no valid frame among so many: the rate or the device is another one
@@ -324,7 +323,7 @@ class Device:
     def _pump(self, wait_s: float) -> int:
         """Move what has come to the driver and its readings to the reader; how many readings there were."""
         assert self._port is not None
-        gather_s = self._last_bytes_s + GATHER_S - time.monotonic()
+        gather_s = self._last_bytes_s + self._driver.gather_s - time.monotonic()
         if gather_s > 0:
             time.sleep(gather_s)
         try:

@@ -37,6 +37,7 @@ class WheelDriver(DriverBase):
         self.baud = self.bauds[0]
         self.identity.model = name
         self.period_s = 0.02
+        self.gather_s = 0.005
         self.poll_period_s = protocol.poll_period_s or None
 
     def start(self) -> Script:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from hw.driver import Ask, Drain, Pause, Reading, Script, Send, SetLines
 from hw.errors import DeviceError, DeviceSilent
-from hw.framing import Bytes, Frames, SizedFrames
+from hw.framing import Bytes, Frames, SizedFrames, median
 from hw.rplidar_wire import Descriptor, xor8
 from hw.scan_assembler import Beams
 from hw.spinning import Floats, Ints, SpinningLidar, carried
@@ -282,7 +282,7 @@ class YdLidar(SpinningLidar):
         step_deg = (angles_deg[:, 1] - angles_deg[:, 0]) % 360.0 / np.maximum(n - 1, 1)
         told = step_deg[(n > 4) & (step_deg < MOST_STEP_DEG) & (step_deg > 0)]
         if len(told):
-            usual_deg = float(np.median(told))
+            usual_deg = median(told)
             has_changed = len(told) >= 4 and abs(usual_deg - self._usual_step_deg) > 0.1 * self._usual_step_deg
             self._usual_step_deg = usual_deg if has_changed else 0.8 * self._usual_step_deg + 0.2 * usual_deg
 
