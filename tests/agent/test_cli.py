@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import importlib.util
+import re
+import shlex
 import subprocess
 import sys
 
 import pytest
 
 from agent import __version__
-from agent.cli import COMMANDS, command_parser, main
+from agent.cli import COMMANDS, command_parser, load_command, main
 from agent.exits import BUG, EXIT_CODES, INTERRUPTED
 
 
@@ -76,3 +78,16 @@ def test_a_reader_that_has_seen_enough_is_no_error() -> None:
         f"{sys.executable} -m agent config show --json | head -1", shell=True, capture_output=True, text=True, check=True
     )
     assert (done.stdout, done.stderr) == ("{\n", "")
+
+
+@pytest.mark.parametrize("name", list(COMMANDS))
+def test_the_examples_of_a_command_can_be_typed(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    module = load_command(name)
+    lines = [line for line in module.EXAMPLES.splitlines() if re.match(r"\s*(sudo )?mapquilt ", line)]
+    assert lines or not module.EXAMPLES
+    for line in lines:
+        words = shlex.split(re.split(r"\s{2,}|\s>\s|\|", line.strip().removeprefix("sudo ").removeprefix("mapquilt "))[0])
+        try:
+            command_parser(words[0]).parse_args(words[1:])
+        except SystemExit:
+            pytest.fail(f"{line}: {capsys.readouterr().err}")
