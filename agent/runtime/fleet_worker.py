@@ -16,6 +16,7 @@ from agent.fleet.coordinator import Coordinator, LocalMap
 from agent.fleet.effects import Changed, Effect, Fetch, Fuse, Match, MatchKind, Note, Send
 from agent.fleet.state import FleetState
 from agent.runtime.exchange import Exchange
+from agent.runtime.guard import Guard, OpenGuard
 from agent.runtime.latest import Latest
 from agent.runtime.merge_worker import Done, Matched, MergeWorker
 from agent.runtime.network import NetworkSettings
@@ -35,8 +36,6 @@ WAIT_S = 0.05
 MAX_PEER_MAPS = 32
 BULK_PULLERS, SMALL_PULLERS = 2, 3  # a silent peer holds one up for 5 s; the others go on
 
-Guard = Callable[[bytes], bytes]
-
 
 class FleetWorker:
     """One coordinator, its exchange, and the threads that pull for it."""
@@ -46,8 +45,7 @@ class FleetWorker:
         coordinator: Coordinator,
         settings: NetworkSettings,
         merger: MergeWorker,
-        seal: Guard = bytes,
-        open_seal: Guard = bytes,
+        guard: Guard | None = None,
         on_note: Callable[[Note], None] | None = None,
     ) -> None:
         self.settings = settings
@@ -60,7 +58,7 @@ class FleetWorker:
         self.global_map: GlobalMap | None = None
         self.peer_maps: dict[str, tuple[bytes, OccupancyGrid]] = {}  # replaced, never changed, by this worker only
         self._coordinator, self._merger, self._on_note = coordinator, merger, on_note
-        self._seal, self._open_seal = seal, open_seal
+        self._guard: Guard = guard or OpenGuard()
         self._turn = threading.Lock()
         self._results: queue.SimpleQueue[Done | tuple[Fetch, Message | None]] = queue.SimpleQueue()
         self._small: queue.Queue[Fetch] = queue.Queue(maxsize=64)
@@ -100,7 +98,7 @@ class FleetWorker:
             return
         message: Message | None = None
         try:
-            pull = Pull(self.exchange, self._open_seal, self.settings.fleet, fetch.peer, self.exchange.closed)
+            pull = Pull(self.exchange, self._guard, self.settings.fleet, fetch.peer, self.exchange.closed)
             message = pull.run(fetch.key, is_bulk=fetch.is_bulk)
         finally:
             self._results.put((fetch, message))
@@ -115,7 +113,7 @@ class FleetWorker:
         if fleet != self.settings.fleet:
             return
         try:
-            message = decode(self._open_seal(payload))
+            message = decode(self._guard.open(payload, robot))
             if message.robot != robot or push_register(message) != register:
                 raise RemoteProtocolError(f"a message of {message.robot} on {register} of {robot}")
         except (RemoteProtocolError, LocalProtocolError) as error:
@@ -150,7 +148,7 @@ class FleetWorker:
             return None
         with self._turn:
             content = self._coordinator.register(register)
-        return None if content is None else self._seal(content)
+        return None if content is None else self._guard.seal(content)
 
     # What goes out.
 
@@ -186,7 +184,7 @@ class FleetWorker:
     def _publish(self, message: Message) -> None:
         channel = BY_KIND[type(message)]
         try:
-            payload = self._seal(encode(message))
+            payload = self._guard.seal(encode(message))
         except LocalProtocolError:
             log.exception("fleet: a message of ours cannot travel")
             return

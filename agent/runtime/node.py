@@ -33,6 +33,7 @@ from agent.mapping.options import MappingOptions
 from agent.merging.result import MatchOptions
 from agent.runtime.control import ControlServer
 from agent.runtime.fleet_worker import FleetWorker
+from agent.runtime.guard import guard_for
 from agent.runtime.health import Health, Notifier, watchdog_period_s
 from agent.runtime.keeper import Keeper
 from agent.runtime.map_worker import MapWorker
@@ -67,7 +68,9 @@ class Node:
         self.map = MapWorker(self._mapper(), self.readings)
         self.merger = MergeWorker(match_options(config))
         coordinator = Coordinator(self.robot, self.boot_id, FleetOptions(min_match_factor=config.matching.min_match_factor))
-        self.fleet = FleetWorker(coordinator, network_settings(config), self.merger, on_note=self.records.add)
+        settings = network_settings(config)
+        guard = guard_for(settings, self.boot_id)
+        self.fleet = FleetWorker(coordinator, settings, self.merger, guard, on_note=self.records.add)
         self.keeper = Keeper(self)
         self.workers = self._workers()
         self.health = Health(self.reports, Notifier())

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import hashlib
 import threading
-from collections.abc import Callable
 from typing import Generic, Protocol, TypeVar
 
+from agent.runtime.guard import Guard
 from protocol.channels import chunk_register, robot_key
 from protocol.codec import decode
 from protocol.errors import RemoteProtocolError
@@ -34,10 +34,8 @@ class Asker(Protocol[P]):
 class Pull(Generic[P]):
     """One transfer.  `run` waits, so it belongs on a worker's thread."""
 
-    def __init__(
-        self, asker: Asker[P], open_seal: Callable[[bytes], bytes], fleet: str, peer: str, closed: threading.Event
-    ) -> None:
-        self._asker, self._open_seal = asker, open_seal
+    def __init__(self, asker: Asker[P], guard: Guard, fleet: str, peer: str, closed: threading.Event) -> None:
+        self._asker, self._guard = asker, guard
         self._fleet, self._peer, self._closed = fleet, peer, closed
         self._retries = 0
 
@@ -90,7 +88,7 @@ class Pull(Generic[P]):
     def _read(self, pending: P) -> Message | None:
         answer = self._asker.receive(pending)
         try:
-            message = None if answer is None else decode(self._open_seal(answer))
+            message = None if answer is None else decode(self._guard.open(answer, self._peer))
         except RemoteProtocolError:
             return None
         return message if message is None or message.robot == self._peer else None
