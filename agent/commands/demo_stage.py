@@ -130,7 +130,12 @@ class RecordedStage:
     def _actor(self, name: str, replay: Replay) -> Actor:
         lidar, wheels = self._lines.add(name, SickScanner(ReplayScans(replay)), ReplayBoard(replay))
         settings = (f"wheels.max_speed_mps={REPLAY_V_MAX_MPS}",)
-        return Actor(name, f"sick:{lidar}?baud={SickScanner.baud}", f"wheels:{wheels}?v_max={REPLAY_V_MAX_MPS}", settings)
+        return Actor(
+            name,
+            f"sick:{lidar}?baud={SickScanner.baud}&rate={SickScanner.baud}",
+            f"wheels:{wheels}?v_max={REPLAY_V_MAX_MPS}",
+            settings,
+        )
 
     def __enter__(self) -> RecordedStage:
         self._lines.open()

@@ -23,7 +23,10 @@ LATE_S = 0.5  # a host that did not look for longer missed the rest: a serial li
 class ByteDevice(Protocol):
     """One simulated device on a line."""
 
-    baud: int
+    @property
+    def baud(self) -> int:
+        """The rate it speaks at now; 0: any, as on USB."""
+        ...
 
     def receive(self, data: bytes, now_s: float) -> None:
         """The host wrote this."""
@@ -83,7 +86,9 @@ class RobotTicks:
     def __init__(self, robot: SimulatedRobot) -> None:
         self._robot = robot
         o = robot.options
-        self.info = wheels.InfoFrame(o.ticks_per_revolution, round(o.wheel_radius_m * 1e6), round(o.track_m * 1e6), "simulated")
+        self.info = wheels.InfoFrame(
+            round(o.ticks_per_revolution), round(o.wheel_radius_m * 1e6), round(o.track_m * 1e6), "simulated"
+        )
 
     def sample(self, time_s: float) -> tuple[int, int, bool]:
         """See `TickSource`."""
@@ -186,6 +191,8 @@ class SickScanner:
         elif payload == sick_lms.POLLED:
             self._is_sending = False
         if payload[0] == sick_lms.MODE:
+            rates = {code: rate for rate, code in sick_lms.RATE_CODES.items()}
+            self.baud = rates.get(payload[-1], self.baud) if len(payload) == 2 else self.baud  # from the answer on
             return b"\xa0\x00\x10"
         if payload[0] == sick_lms.VARIANT:
             return b"\xbb\x01" + payload[1:] + b"\x10"

@@ -34,7 +34,7 @@ class DriveOptions:
     turn_rad_s: float = 1.2
     track_m: float = 0.30
     wheel_radius_m: float = 0.05
-    ticks_per_revolution: int = 2048
+    ticks_per_revolution: float = 2048
     scale_error: float = 0.005  # one sigma, each wheel, the whole run
     slip: float = 0.02  # one sigma of a metre driven, as a fraction, of each wheel
     first_ticks: tuple[int, int] = (0, 0)

@@ -7,9 +7,11 @@ SimPort       the same device as a `Port`, for `sim:office?seed=3` and `log:run.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import pty
 import select
+import struct
 import threading
 import time
 import tty
@@ -22,6 +24,7 @@ from hw.errors import DeviceConfigError
 from hw.ld06 import Ld06
 from hw.sick_lms import SickLms
 from hw.sim.devices import ByteDevice, Ld06Lidar, RobotTicks, SickScanner, Wt1Board
+from hw.sim.faults import FaultyDevice, garbled
 from hw.sim.robot import SimulatedRobot
 from hw.sim.world import open_world
 from hw.supervisor import Device
@@ -30,40 +33,74 @@ from hw.wheel_driver import WheelDriver
 from hw.wheels import WheelBoard
 
 TICK_S = 0.01  # how often bytes move; a 230400 baud line carries 230 bytes in that time
+TCGETS2 = 0x802C542A
+TERMIOS2 = struct.Struct("=4IB19sII")  # flags, line discipline, control characters, input and output rate
 REPLAY_V_MAX_MPS = 100.0  # a recording is driven faster than any robot
 
 
 class PtyLine:
-    """One device on one pseudo-terminal behind a link whose name stays the same."""
+    """One device on one pseudo-terminal behind a link whose name stays the same.
+
+    The line has a rate: a client that opens it at another one hears garbage and is not understood, unless the device's
+    `baud` is 0, as on USB.
+    """
 
     def __init__(self, device: ByteDevice, link: Path) -> None:
         self.device, self.link = device, link
+        self._master = -1
+        self._poll = select.poll()
+        self.plug()
+
+    def plug(self) -> None:
+        """The port appears, under whatever name the system gives it."""
         self._master, slave = pty.openpty()
         tty.setraw(slave)  # a fresh pty echoes: device bytes would come back as commands
         os.set_blocking(self._master, False)
-        aside = link.with_name(link.name + ".new")
+        aside = self.link.with_name(self.link.name + ".new")
         aside.unlink(missing_ok=True)
         aside.symlink_to(os.ttyname(slave))
-        aside.replace(link)
+        aside.replace(self.link)
         os.close(slave)
-        self._poll = select.poll()
         self._poll.register(self._master, select.POLLIN)
+
+    def unplug(self) -> None:
+        """The port is gone; whoever has it open reads an error."""
+        if self._master >= 0:
+            self.link.unlink(missing_ok=True)
+            self._poll.unregister(self._master)
+            os.close(self._master)
+            self._master = -1
 
     def pump(self, now_s: float) -> None:
         """Move what is due in both directions; while nobody has the port open, the device talks to the air."""
+        faulty = self.device if isinstance(self.device, FaultyDevice) else None
+        if faulty and faulty.is_absent(now_s):
+            self.unplug()
+            self.device.emit(now_s)
+            return
+        if self._master < 0:
+            self.plug()
         events = dict(self._poll.poll(0)).get(self._master, 0)
+        is_open = not events & select.POLLHUP
+        is_right_rate = not is_open or self.device.baud in (0, client_baud(self._master))
         if events & select.POLLIN:
             with contextlib.suppress(OSError):
-                self.device.receive(os.read(self._master, 4096), now_s)
+                data = os.read(self._master, 4096)
+                self.device.receive(data if is_right_rate else garbled(data), now_s)
         out = self.device.emit(now_s)
-        if out and not events & select.POLLHUP:
+        if out and (is_open or (faulty and faulty.keeps_talking)):
             with contextlib.suppress(OSError):  # a full line loses bytes, as a serial line does
-                os.write(self._master, out)
+                os.write(self._master, out if is_right_rate else garbled(out))
 
     def close(self) -> None:
-        """Unplug."""
-        self.link.unlink(missing_ok=True)
-        os.close(self._master)
+        """Unplug for good."""
+        self.unplug()
+
+
+def client_baud(master: int) -> int:
+    """The rate at which the other side has opened a pty; termios2 also tells the odd ones."""
+    answer = fcntl.ioctl(master, TCGETS2, bytes(TERMIOS2.size))
+    return int(TERMIOS2.unpack(answer)[-1])
 
 
 class PtyServer:

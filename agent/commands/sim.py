@@ -1,0 +1,144 @@
+"""`mapquilt sim DEVICE --link PATH`: a simulated sensor on a pseudo-terminal, for people without hardware and other software."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import signal
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import cast
+
+from agent.exits import OK, USAGE, CommandError
+from hw.errors import DeviceConfigError
+from hw.sim.bases_sim import Counter
+from hw.sim.catalogue import BASES, LIDARS, NAMES, USUAL, device_url
+from hw.sim.devices import ByteDevice
+from hw.sim.faults import KINDS, RATES, FaultyDevice, Schedule
+from hw.sim.robot import DriveOptions, SimulatedRobot
+from hw.sim.sight import PoseSource, Sight, Standing
+from hw.sim.sim_port import PtyServer
+from hw.sim.world import World, open_world
+from protocol.geometry import SE2
+
+EXAMPLES = """\
+  mapquilt sim rplidar-a1 --link /tmp/lidar                        an RPLIDAR that stands in an office
+  mapquilt sim ld06 --link /tmp/lidar --explore --also wt1=/tmp/wheels
+                                                                   a robot that explores: LIDAR and wheel encoders
+  mapquilt sim hokuyo-utm --link /tmp/lidar --world room.txt --pose 2,1.5,90 --noise 0
+  mapquilt sim xv11 --link /tmp/lidar --fault drop@5:20,stall@10:2,unplug@15:3
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of `mapquilt sim`."""
+    parser.add_argument("device", metavar="DEVICE", help=f"one of {', '.join(NAMES)}")
+    parser.add_argument(
+        "--link", metavar="PATH", required=True, type=Path, help="the port appears here, and again here after a replug"
+    )
+    parser.add_argument(
+        "--also", metavar="DEVICE=PATH", action="append", default=[], help="another device of the same robot; may be repeated"
+    )
+    parser.add_argument(
+        "--world",
+        default="office",
+        help="office, outdoor, random, each with ?seed=N, or a file of walls: 'x0 y0 x1 y1' a line, metres",
+    )
+    parser.add_argument(
+        "--pose", metavar="X,Y,DEG", help="where the robot stands, or starts (default: a free place in the world)"
+    )
+    parser.add_argument(
+        "--noise", metavar="METRES", type=float, default=0.01, help="one sigma of a range; 0: exact (default 0.01)"
+    )
+    parser.add_argument("--explore", action="store_true", help="the robot drives around by itself, not into walls")
+    parser.add_argument(
+        "--speed", metavar="M/S", type=float, default=USUAL.speed_mps, help="of the exploring robot (default %(default)s)"
+    )
+    parser.add_argument(
+        "--fault",
+        metavar="SCHEDULE",
+        default="",
+        help=f"KIND@SECONDS[:VALUE] or RATE=..., with commas; kinds: {', '.join(KINDS)}; rates: {', '.join(RATES)}",
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of noise, faults and the way the robot takes")
+    parser.add_argument("--seconds", type=float, default=math.inf, help="end after so long (default: when stopped)")
+    parser.add_argument(
+        "--mirrored", action="store_true", help="turn the scan the wrong way round: to see that a check of it can fail"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve until stopped."""
+    try:
+        served = _devices(args)
+        lines = [(FaultyDevice(device, Schedule.parse(args.fault), args.seed), path) for _, device, path in served]
+    except DeviceConfigError as error:
+        raise CommandError(str(error), USAGE) from error
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    try:
+        with PtyServer(lines):
+            if not args.quiet:
+                for name, _, path in served:
+                    print(f"{path} -> {os.path.realpath(path)}  {name}; use it as {device_url(name, path)}", flush=True)
+            stop.wait(None if math.isinf(args.seconds) else args.seconds)
+    except OSError as error:
+        raise CommandError(f"{args.link}: {error.strerror or error}; the folder must exist and be writable", USAGE) from error
+    return OK
+
+
+def _devices(args: argparse.Namespace) -> list[tuple[str, ByteDevice, Path]]:
+    """(name, device, link) of all devices asked for, on one robot."""
+    asked = [(args.device, args.link), *(_also(entry) for entry in args.also)]
+    for name, _ in asked:
+        if name not in NAMES:
+            raise DeviceConfigError(f"{name}: no such device; there are {', '.join(NAMES)}")
+    if args.noise < 0 or not 0 < args.speed <= 2:
+        raise DeviceConfigError(
+            f"--noise {args.noise:g} must not be negative, --speed {args.speed:g} must be above 0 and at most 2"
+        )
+    world = open_world(args.world)
+    pose = _pose(args.pose) if args.pose else world.start_poses(1, args.seed)[0]
+    base = _base(args, world, pose, next((BASES[name].drive for name, _ in asked if name in BASES), USUAL))
+    return [(name, _device(name, base, args), path) for name, path in asked]
+
+
+def _also(entry: str) -> tuple[str, Path]:
+    name, equals, path = entry.partition("=")
+    if not equals or not path:
+        raise DeviceConfigError(f"--also {entry}: write it as DEVICE=PATH, for example wt1=/tmp/wheels")
+    return name, Path(path)
+
+
+def _pose(text: str) -> SE2:
+    try:
+        x_m, y_m, heading_deg = (float(word) for word in text.split(","))
+    except ValueError:
+        raise DeviceConfigError(f"--pose {text}: write it as x,y,degrees, for example 2,1.5,90") from None
+    return SE2(x_m, y_m, math.radians(heading_deg))
+
+
+def _base(args: argparse.Namespace, world: World, pose: SE2, drive: DriveOptions) -> PoseSource:
+    """What the devices sit on."""
+    if not args.explore:
+        return _Parked(world, pose)
+    robot = SimulatedRobot(world, pose, args.seed, replace(drive, speed_mps=args.speed))
+    robot.begin()
+    return robot
+
+
+class _Parked(Standing):
+    """Wheels that never turn."""
+
+    def ticks_at(self, time_s: float) -> tuple[int, int]:
+        """See `Counter`."""
+        return 0, 0
+
+
+def _device(name: str, base: PoseSource, args: argparse.Namespace) -> ByteDevice:
+    if name in BASES:
+        return BASES[name].make(cast(Counter, base))
+    return LIDARS[name][0](Sight(base, args.noise, seed=args.seed, is_mirrored=args.mirrored))
