@@ -7,6 +7,7 @@ usage() {
 sudo deploy/install.sh [options]             install or update
 sudo deploy/install.sh --uninstall [--purge] take it off again; --purge also removes settings and maps
 
+  --keys DIR          put the robot's keys in place: DIR is what mapquilt fleet enroll made for it
   --robot ID          also start the service mapquilt@ID now and at every boot
   --wheelhouse DIR    take the packages from this directory instead of the network (deploy/wheelhouse.sh makes one)
   --root DIR          put everything below DIR instead of / (to look at it, or to build an image)
@@ -15,6 +16,7 @@ What goes where:
   /opt/mapquilt                               the program and its packages
   /usr/local/bin/mapquilt                     the command
   /etc/mapquilt/robot.toml                    settings; yours are never overwritten
+  /etc/mapquilt/fleet                         keys, for root and the service only
   /etc/systemd/system/mapquilt@.service       the service
   /etc/udev/rules.d/90-mapquilt.rules         who may use the serial ports
   /etc/modules-load.d/mapquilt.conf           serial drivers, there before the first plug
@@ -26,11 +28,12 @@ stop() { printf 'mapquilt: %s\n' "$2" >&2; exit "$1"; }
 
 here=$(dirname "$(readlink -f -- "$0")")
 source=${here%/*}
-root='' robot='' wheelhouse='' action=install purge=no
+root='' robot='' wheelhouse='' keys='' action=install purge=no
 while [ $# -gt 0 ]; do
     case $1 in
         --robot) robot=${2:?--robot needs an id}; shift ;;
         --wheelhouse) wheelhouse=$(readlink -f -- "${2:?--wheelhouse needs a directory}"); shift ;;
+        --keys) keys=$(readlink -f -- "${2:?--keys needs a directory}"); shift ;;
         --root) root=$(readlink -f -- "${2:?--root needs a directory}"); shift ;;
         --uninstall) action=uninstall ;;
         --purge) purge=yes ;;
@@ -55,12 +58,14 @@ systemd_runs() { live systemctl && [ -d /run/systemd/system ]; }
 check() {
     [ -n "$root" ] || [ "$(id -u)" = 0 ] || stop 3 "this needs root: sudo $0"
     [ -z "$wheelhouse" ] || ls "$wheelhouse"/*.whl >/dev/null 2>&1 || stop 4 "$wheelhouse holds no .whl files; make it with: deploy/wheelhouse.sh $wheelhouse"
+    [ -z "$keys" ] || [ -f "$keys/fleet.key" ] || stop 4 "$keys holds no fleet.key; give the robot's bundle: mapquilt fleet enroll DIR ROBOT makes it"
 }
 
 # File to place, through a new name: a reader never sees half of it.
 place() { # mode source target
     mkdir -p "${3%/*}"
-    cp "$2" "$3.new"
+    rm -f "$3.new"
+    (umask 077 && cp "$2" "$3.new")
     chmod "$1" "$3.new"
     mv -f "$3.new" "$3"
 }
@@ -100,7 +105,12 @@ place_settings() {
     place 644 "$here/robot.toml" "$settings/robot.toml.sample"
     [ -f "$settings/robot.toml" ] || place 644 "$here/robot.toml" "$settings/robot.toml"
     [ -n "$root" ] || getent group mapquilt >/dev/null || groupadd --system mapquilt
-    [ -n "$root" ] || chgrp mapquilt "$settings/fleet"
+    if [ -n "$keys" ]; then
+        for file in "$keys"/*; do
+            place 640 "$file" "$settings/fleet/${file##*/}"
+        done
+    fi
+    [ -n "$root" ] || chgrp -R mapquilt "$settings/fleet"
     chmod 750 "$settings/fleet"
 }
 

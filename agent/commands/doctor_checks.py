@@ -210,7 +210,7 @@ def security(machine: Machine) -> Iterator[Finding]:
                 Level.WARN,
                 "security",
                 f"open on profile {fleet.profile}: anybody on the network can send maps",
-                "mapquilt fleet init",
+                "mapquilt fleet init keys",
             )
     elif fleet.security == "shared":
         yield _private_file("security", "fleet key", fleet.key_file)
@@ -248,7 +248,7 @@ def _private_file(what: str, name: str, path: str) -> Finding:
     try:
         mode = Path(path).stat().st_mode
     except OSError as error:
-        return Finding(Level.FAIL, what, f"{name} {path or '(none given)'}: {error.strerror}", "mapquilt fleet init")
+        return Finding(Level.FAIL, what, f"{name} {path or '(none given)'}: {error.strerror}", "mapquilt fleet init keys")
     if mode & stat.S_IRWXO:
         return Finding(Level.FAIL, what, f"{name} {path} can be read by everybody", f"chmod o-rwx {path}")
     if not os.access(path, os.R_OK):
@@ -260,7 +260,7 @@ def _private_file(what: str, name: str, path: str) -> Finding:
 
 def _certificate(path: Path) -> Finding:
     if not path.is_file():
-        return Finding(Level.FAIL, "security", f"{path}: no such certificate", "mapquilt fleet enroll ROBOT")
+        return Finding(Level.FAIL, "security", f"{path}: no such certificate", "mapquilt fleet enroll keys ROBOT")
     openssl = shutil.which("openssl")
     if openssl is None:
         return ok("security", f"{path} (install openssl to see when it expires)")
@@ -268,9 +268,9 @@ def _certificate(path: Path) -> Finding:
     done = subprocess.run(asked, capture_output=True, text=True, timeout=10, check=False)
     end = next((line.partition("=")[2] for line in done.stdout.splitlines() if line.startswith("notAfter=")), "")
     if not end:
-        return Finding(Level.FAIL, "security", f"{path}: no certificate can be read from it", "mapquilt fleet enroll ROBOT")
+        return Finding(Level.FAIL, "security", f"{path}: no certificate can be read from it", "mapquilt fleet enroll keys ROBOT")
     if done.returncode:
-        return Finding(Level.WARN, "security", f"{path} expires on {end}", "mapquilt fleet enroll ROBOT")
+        return Finding(Level.WARN, "security", f"{path} expires on {end}", "mapquilt fleet enroll keys ROBOT")
     return ok("security", f"{path} is valid until {end}")
 
 

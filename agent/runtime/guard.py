@@ -56,7 +56,7 @@ def guard_for(settings: NetworkSettings, boot: int) -> Guard:
         mode, secret = path.stat().st_mode, path.read_text().strip()
     except (OSError, UnicodeDecodeError) as error:
         raise NetworkConfigError(f"{path}: no readable key of the fleet ({error}); mapquilt fleet init makes one") from error
-    if mode & 0o077:
+    if mode & 0o027:  # the group may read: the service's user exists only while it runs, so its group holds the key
         raise NetworkConfigError(f"{path}: others on this machine may read the fleet's key; chmod 600 {path}")
     try:
         return SharedGuard(derive_key(secret, settings.fleet), settings.robot, boot)

@@ -102,6 +102,22 @@ def test_a_wheelhouse_is_the_only_source_of_packages(source: Path, target: Path,
     assert f"find-links {house}" in install(source, "--root", target, "--wheelhouse", house).stdout
 
 
+def test_keys_are_for_the_service_only(source: Path, target: Path, tmp_path: Path) -> None:
+    bundle = tmp_path / "robot-1"
+    bundle.mkdir()
+    refused = install(source, "--root", target, "--keys", bundle)
+    assert refused.returncode == 4
+    assert "holds no fleet.key" in refused.stderr
+    for name in ("fleet.key", "robot-1.key"):
+        (bundle / name).write_text(name)
+    assert install(source, "--root", target, "--keys", bundle).returncode == 0
+    placed = sorted((target / "etc/mapquilt/fleet").iterdir())
+    assert [(path.name, path.read_text(), path.stat().st_mode & 0o777) for path in placed] == [
+        ("fleet.key", "fleet.key", 0o640),
+        ("robot-1.key", "robot-1.key", 0o640),
+    ]
+
+
 def test_mistakes_are_told(source: Path, target: Path) -> None:
     for words, said in (
         (["--rot", target], "unknown option --rot"),

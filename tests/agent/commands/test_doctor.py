@@ -177,7 +177,7 @@ def test_the_command_tells_everything_and_ends_with_1_when_something_failed(run:
         "level": "FAIL",
         "what": "security",
         "finding": "fleet key /none: No such file or directory",
-        "mend": "mapquilt fleet init",
+        "mend": "mapquilt fleet init keys",
     } in found
 
 
