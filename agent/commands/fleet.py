@@ -131,7 +131,7 @@ def access_control(fleet: str, members: dict[str, Any]) -> dict[str, Any]:
     policies: list[dict[str, Any]] = [{"rules": ["say"], "subjects": ["anybody"]}]
     for name, entry in sorted(members.items()):
         subjects.append({"id": name, "cert_common_names": [name]})
-        own = [robot_key(fleet, name, "**"), version_key(fleet, name)]
+        own = [robot_key(fleet, name, "**"), version_key(fleet, name), fleet_key(fleet, f"r/{name}-prior$*/**")]
         rules.append({"id": f"write-{name}", "messages": WRITES, "flows": ["ingress"], "permission": "allow", "key_exprs": own})
         allowed = ["read", "carry"] if entry["role"] == "router" else ["read", f"write-{name}"]
         policies.append({"rules": allowed, "subjects": [name]})

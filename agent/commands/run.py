@@ -21,6 +21,7 @@ import cv2
 from agent.config import Config, control_socket, state_dir
 from agent.config_flags import add_config_arguments, load_from
 from agent.exits import BAD_INPUT, ENVIRONMENT, OK, PEER, USAGE, CommandError
+from agent.map_files import MapFileError
 from agent.runtime.control import ControlError
 from agent.runtime.exchange import ExchangeError
 from agent.runtime.log_setup import set_up_logging
@@ -89,6 +90,8 @@ def make_node(config: Config, *, keeps_state: bool) -> Node:
         return Node(config, folder, control_socket(config.robot.id, os.environ))
     except (DeviceConfigError, NetworkConfigError) as error:
         raise CommandError(str(error), USAGE) from error
+    except MapFileError as error:
+        raise CommandError(str(error), BAD_INPUT) from error
 
 
 @contextlib.contextmanager

@@ -9,6 +9,7 @@ fleet      messages, results, time   messages, jobs            5 s
 pull-*     fetches                   pulled messages           60 s
 merge      match and fuse jobs       results                   120 s
 keeper     everything, to look       disk, links               30 s
+*-prior*   as fleet and pull, for a given map
 
 Values only flow to the right and down; every arrow is a mailbox that never grows.  The main thread feeds the watchdog.
 """
@@ -39,6 +40,7 @@ from agent.runtime.keeper import Keeper
 from agent.runtime.map_worker import MapWorker
 from agent.runtime.merge_worker import MergeWorker
 from agent.runtime.network import NetworkSettings
+from agent.runtime.priors import FrozenPeer
 from agent.runtime.records import Records
 from agent.runtime.sensing import Readings, device_step
 from agent.runtime.state import StateDirectory
@@ -67,10 +69,13 @@ class Node:
         self.readings = Readings()
         self.map = MapWorker(self._mapper(), self.readings)
         self.merger = MergeWorker(match_options(config))
-        coordinator = Coordinator(self.robot, self.boot_id, FleetOptions(min_match_factor=config.matching.min_match_factor))
+        options = FleetOptions(min_match_factor=config.matching.min_match_factor)
+        coordinator = Coordinator(self.robot, self.boot_id, options)
         settings = network_settings(config)
         guard = guard_for(settings, self.boot_id)
         self.fleet = FleetWorker(coordinator, settings, self.merger, guard, on_note=self.records.add)
+        given = enumerate(map(Path, config.fleet.priors), start=1)
+        self.priors = [FrozenPeer(path, number, settings, self.merger, options) for number, path in given]
         self.keeper = Keeper(self)
         self.workers = self._workers()
         self.health = Health(self.reports, Notifier())
@@ -98,7 +103,7 @@ class Node:
         ]
         if self.wheels is not None:
             table.append(row("wheels", device_step(self.wheels, self.readings), 5.0, "wheel device", "readings"))
-        return table
+        return table + [worker for prior in self.priors for worker in prior.workers()]
 
     def _mapper(self) -> Mapper:
         """Where the last run stopped when its map is on disk and sound, else a new one."""
@@ -123,6 +128,8 @@ class Node:
     def __enter__(self) -> Node:
         try:
             self.fleet.exchange.open()
+            for prior in self.priors:
+                prior.open(tuple(self.fleet.exchange.locators()))
             if self.control is not None:
                 self.control.start()
             self.lidar.start()
@@ -164,6 +171,8 @@ class Node:
         for device in (self.lidar, self.wheels):
             if device is not None:
                 device.stop()
+        for prior in self.priors:
+            prior.close()
         self.fleet.exchange.close()
 
     def reset_map(self) -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from agent.commands.demo_figures import agreement, aligned
 from agent.commands.demo_stage import Stage
+from agent.map_files import save_map
 from protocol.geometry import SE2
 from tests.harness.fleet import Fleet
 
@@ -80,3 +81,16 @@ def test_a_robot_stops_cleanly_within_two_seconds(fleet: Fleet, number: signal.S
     agent.signal(number)
     assert agent.process.wait(2.0) == 0
     assert "Traceback" not in agent.log_tail(1000)
+
+
+def test_a_robot_finds_itself_in_a_given_map(fleet: Fleet) -> None:
+    stage = fleet.stage("office", robots=1)
+    truth, start = stage.truth(), stage.start_pose("robot-1")
+    assert truth is not None and start is not None
+    save_map(truth, fleet.folder / "office")
+    fleet.start(stage.robots[0], arguments=["--prior", str(fleet.folder / "office.yaml")])
+    stage.begin()
+    fleet.until(lambda: "robot-1-prior1" in fleet.members("robot-1"), MERGE_WITHIN_S, "localization")
+    status = fleet.status("robot-1")
+    assert status["root"] == "robot-1-prior1"  # the given map's frame is the fleet's
+    assert SE2(*status["frames"]["robot-1"]).distance_m(start) < 0.15
