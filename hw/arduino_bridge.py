@@ -24,18 +24,18 @@ MOVED_TICKS = 20  # counters that were further from zero than this and read exac
 _ENCODERS = re.compile(rb"(-?\d{1,10}) (-?\d{1,10})")
 
 
-def encode_encoders(left: int, right: int) -> bytes:
+def encode_counts(left: int, right: int) -> bytes:
     """The answer to `e`."""
     return b"%d %d\r\n" % (left, right)
 
 
-def decode_encoders(line: bytes) -> tuple[int, int] | None:
+def decode_counts(line: bytes) -> tuple[int, int] | None:
     """Both counters, or None when the line is something else."""
     match = _ENCODERS.fullmatch(line)
     if match is None:
         return None
     left, right = int(match[1]), int(match[2])
-    return (left, right) if -(2**31) <= min(left, right) and max(left, right) < 2**31 else None
+    return (left, right) if min(left, right) >= -(2**31) and max(left, right) < 2**31 else None
 
 
 class ArduinoBridge:
@@ -69,7 +69,7 @@ class ArduinoBridge:
         self._pending[:] = tail[-MAX_LINE_BYTES:]
         samples = []
         for line in lines:
-            counts = decode_encoders(line.strip(b"\r"))
+            counts = decode_counts(line.strip(b"\r"))
             if counts is None:
                 self.counters.skip(len(line) + 1)
                 continue

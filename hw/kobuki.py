@@ -1,7 +1,7 @@
 """Kobuki, the base of the TurtleBot 2: feedback packets at 50 Hz with both wheel encoders and a clock.
 
-    AA 55 len payload chk         chk = xor of len and payload; payload = {id len data}*; little-endian; SERIAL.md 7.2
-    core (id 1, 15 bytes)         ms:u16 bumper drop cliff left:u16 right:u16 pwmL pwmR button charger battery overcurrent
+AA 55 len payload chk         chk = xor of len and payload; payload = {id len data}*; little-endian; SERIAL.md 7.2
+core (id 1, 15 bytes)         ms:u16 bumper drop cliff left:u16 right:u16 pwmL pwmR button charger battery overcurrent
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _CORE = struct.Struct("<HBBBHHbbBBBB")
 
 
 @dataclass(frozen=True, slots=True)
-class CoreFeedback:
+class Core:
     """What the core sub-payload says."""
 
     clock_ms: int  # u16
@@ -40,12 +40,12 @@ class CoreFeedback:
         return bytes((CORE, _CORE.size)) + _CORE.pack(*counts, 0, 0, 0, 0, self.battery_dv, 0)
 
     @staticmethod
-    def decode(data: bytes) -> CoreFeedback | None:
+    def decode(data: bytes) -> Core | None:
         """From the 15 bytes behind id and length."""
         if len(data) != _CORE.size:
             return None
         ms, bumper, drop, cliff, left, right, _, _, _, _, battery_dv, _ = _CORE.unpack(data)
-        return CoreFeedback(ms, left, right, bumper, drop, cliff, battery_dv)
+        return Core(ms, left, right, bumper, drop, cliff, battery_dv)
 
 
 def encode(payload: bytes) -> bytes:
@@ -68,9 +68,14 @@ def decode(frame: bytes) -> dict[int, bytes] | None:
     return parts if at == end else None
 
 
-def drive_straight(speed_mm_s: int) -> bytes:
-    """The base control command; mapquilt only reads, a simulator understands it."""
-    return encode(struct.pack("<BBhh", BASE_CONTROL, 4, speed_mm_s, 0))
+def base_control(speed_mm_s: int, radius_mm: int) -> bytes:
+    """The command to drive; mapquilt only reads, a simulator understands it."""
+    return encode(struct.pack("<BBhh", BASE_CONTROL, 4, speed_mm_s, radius_mm))
+
+
+def request_extra(flags: int) -> bytes:
+    """The command that asks for versions: 1 hardware, 2 firmware, 8 unique id."""
+    return encode(struct.pack("<BBH", REQUEST_EXTRA, 2, flags))
 
 
 class Kobuki:
@@ -103,7 +108,7 @@ class Kobuki:
         samples = []
         for row in self._frames.take(self._window, self.counters).data:
             parts = decode(row[: int(row[2]) + 4].tobytes()) or {}
-            core = CoreFeedback.decode(parts.get(CORE, b""))
+            core = Core.decode(parts.get(CORE, b""))
             if core is not None:
                 samples.append(TickSample(core.left_ticks, core.right_ticks, 16, core.clock_ms / 1e3, CLOCK_PERIOD_S))
         return samples

@@ -17,10 +17,9 @@ from hw.odometry import TickSample, WheelGeometry
 
 BAUD_RATES = (38400, 115200, 460800, 230400, 57600, 19200, 9600)  # 38400 is the factory's; over USB any will do
 FIRST_ADDRESS, LAST_ADDRESS = 0x80, 0x87
-READ_LEFT, READ_RIGHT, RESET_ENCODERS, READ_VERSION, READ_MAIN_BATTERY, READ_ENCODERS = 16, 17, 20, 21, 24, 78
+READ_M1, READ_M2, RESET_ENCODERS, READ_VERSION, READ_MAIN_BATTERY, READ_ENCODERS = 16, 17, 20, 21, 24, 78
 ANSWER_BYTES = 10
 POLL_PERIOD_S = 0.02
-MAX_PENDING_BYTES = 256
 
 
 def crc16(data: bytes) -> int:
@@ -33,26 +32,32 @@ def sealed(question: bytes, data: bytes) -> bytes:
     return data + struct.pack(">H", crc16(question + data))
 
 
+def opened(address: int, command: int, answer: bytes) -> bytes | None:
+    """The data of an answer, or None when its checksum does not fit the question."""
+    return answer[:-2] if len(answer) > 2 and crc16(bytes((address, command)) + answer) == 0 else None
+
+
 def write_command(address: int, command: int, data: bytes = b"") -> bytes:
     """A command that changes something, as the host sends it."""
     body = bytes((address, command)) + data
     return body + struct.pack(">H", crc16(body))
 
 
-def encode_encoders(address: int, left: int, right: int) -> bytes:
+def encode_counts(address: int, left: int, right: int) -> bytes:
     """The answer to `READ_ENCODERS`."""
     return sealed(bytes((address, READ_ENCODERS)), struct.pack(">II", left % 2**32, right % 2**32))
 
 
-def decode_encoders(address: int, answer: bytes) -> tuple[int, int] | None:
+def decode_counts(address: int, answer: bytes) -> tuple[int, int] | None:
     """Both counters as signed numbers, or None when this is no such answer."""
-    if len(answer) != ANSWER_BYTES or crc16(bytes((address, READ_ENCODERS)) + answer) != 0:
+    data = opened(address, READ_ENCODERS, answer)
+    if data is None or len(data) != 8:
         return None
-    left, right = struct.unpack(">ii", answer[:8])
+    left, right = struct.unpack(">ii", data)
     return left, right
 
 
-class Roboclaw:
+class RoboClaw:
     """`BaseProtocol`: asks for both counters; motor 1 is the left wheel."""
 
     baud_rates: tuple[int, ...] = BAUD_RATES
@@ -82,7 +87,7 @@ class Roboclaw:
         self._pending += data
         samples = []
         while len(self._pending) >= ANSWER_BYTES:
-            counts = decode_encoders(self._address, bytes(self._pending[:ANSWER_BYTES]))
+            counts = decode_counts(self._address, bytes(self._pending[:ANSWER_BYTES]))
             if counts is None:
                 del self._pending[0]
                 self.counters.skip(1)
