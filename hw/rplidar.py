@@ -11,6 +11,7 @@ import struct
 import numpy as np
 from numpy.typing import NDArray
 
+from hw import rplidar_hq
 from hw import rplidar_wire as wire
 from hw.driver import Ask, Drain, Pause, Reading, Script, Send, SetLines
 from hw.errors import DeviceError, DeviceSilent
@@ -18,16 +19,16 @@ from hw.framing import Bytes, ByteWindow, FixedFrames
 from hw.rplidar_capsules import KINDS, CapsuleKind, frames_of, start_angles_q6
 from hw.rplidar_nodes import NodeFinder
 from hw.scan_assembler import Beams
-from hw.spinning import Floats, Ints, SpinningLidar, carried
+from hw.spinning import STRICT_ABOVE, Floats, Ints, SpinningLidar, carried
 
 BAUDS = (115200, 460800, 256000, 1000000)
 RANGE_MIN_M, RANGE_MAX_M = 0.05, 40.0
 DEFAULT_PWM, DEFAULT_RPM = 660, 600
 MODES = {"standard": wire.NODE_TYPE, "express": wire.EXPRESS_TYPE, "dense": wire.DENSE_TYPE}
-MODES |= {"ultra": wire.ULTRA_TYPE, "ultradense": wire.ULTRA_DENSE_TYPE}
+MODES |= {"ultra": wire.ULTRA_TYPE, "ultradense": wire.ULTRA_DENSE_TYPE, "hq": wire.HQ_TYPE}
 CIRCLE_Q6 = 360 * 64
 MOST_HZ = 100.0  # a capsule that spans more of the circle than this speed allows is not one
-SPAN_TOLERANCE = 0.05  # real capsules differ by 2 % (SERIAL.md 1.7); a damaged angle by more, or it does not matter
+LOOSE_SPAN, STRICT_SPAN = 0.05, 0.015  # real capsules differ by 1 to 2 % (SERIAL.md 1.7); on a bad line some of them are given up
 NEW_SPEED_AFTER = 4  # so many strange spans in a row are a new speed
 
 
@@ -158,7 +159,7 @@ class Rplidar(SpinningLidar):
             kind = yield from self._ask_conf(wire.CONF_ANSWER_TYPE, mode)
             if kind is None or not kind.value:
                 continue
-            if kind.value[0] == MODES.get(self._mode, kind.value[0]) and kind.value[0] in KINDS:
+            if kind.value[0] == MODES.get(self._mode, kind.value[0]) and kind.value[0] in wire.SCAN_LENGTHS:
                 return mode
         if self._mode == "auto":
             return None
@@ -247,6 +248,9 @@ class Rplidar(SpinningLidar):
         if self.scan_type == wire.NODE_TYPE:
             frames = self._nodes.take(window, self.counters)
             angles_q6 = [row[1] >> 1 | row[2] << 7 for row in frames.data.tolist()]
+        elif self.scan_type == wire.HQ_TYPE:
+            frames = rplidar_hq.FRAMES.take(window, self.counters)
+            return self._hold(frames, now_s, len(frames) > 0)
         elif self.scan_type in self._capsules:
             frames = self._capsules[self.scan_type].take(window, self.counters)
             angles_q6 = (start_angles_q6(KINDS[self.scan_type], frames.data)[0]).tolist()
@@ -262,6 +266,8 @@ class Rplidar(SpinningLidar):
     def _beams(self, frames: Bytes, gaps: Ints, arrivals_s: Floats) -> Beams:
         if self.scan_type == wire.NODE_TYPE:
             return self._node_beams(frames, gaps, arrivals_s)
+        if self.scan_type == wire.HQ_TYPE:
+            return self._hq_beams(frames, gaps, arrivals_s)
         assert self.scan_type is not None
         return self._capsule_beams(KINDS[self.scan_type], frames, gaps, arrivals_s)
 
@@ -282,6 +288,22 @@ class Rplidar(SpinningLidar):
         """Nodes were chosen by how they follow; capsules are chosen by the one behind them, when they are decoded."""
         return data, gaps, arrivals_s
 
+    def _hq_beams(self, frames: Bytes, gaps: Ints, arrivals_s: Floats) -> Beams:
+        turn_deg, mm, quality = rplidar_hq.decode(frames)
+        n = rplidar_hq.BEAMS
+        span_deg = (turn_deg[:, -1] - turn_deg[:, 0]) % 360.0
+        sample_s = span_deg / 360.0 * self.period_s / (n - 1)
+        sent_s = rplidar_hq.FRAME_BYTES * 10.0 / self.baud
+        stamps_s = (arrivals_s - sent_s)[:, None] - sample_s[:, None] * np.arange(n - 1, -1, -1)
+        return Beams(
+            turn_deg=turn_deg.ravel(),
+            angles_rad=-np.radians(turn_deg).ravel(),
+            ranges_m=np.where(mm == 0, np.nan, mm / 1e3).ravel(),
+            stamps_s=stamps_s.ravel(),
+            intensities=quality.ravel(),
+            is_dirty=np.repeat(gaps > 0, n),
+        )
+
     def _capsule_beams(self, kind: CapsuleKind, frames: Bytes, gaps: Ints, arrivals_s: Floats) -> Beams:
         """Beams of all capsules whose follower is here; the last one waits for its own."""
         if self._last_capsule is not None:
@@ -291,6 +313,7 @@ class Rplidar(SpinningLidar):
         self._last_capsule, self._last_gap, self._last_arrival_s = frames[-1:], int(gaps[-1]), float(arrivals_s[-1])
         start_q6, is_first = start_angles_q6(kind, frames)
         span_q6 = np.diff(start_q6) % CIRCLE_Q6
+        self._is_strict = float(np.mean(gaps > 0)) > STRICT_ABOVE
         is_true = self._are_true(kind, span_q6, start_q6[:-1], (gaps[1:] == 0) & ~is_first[1:])
         this, following = frames[:-1][is_true], frames[1:][is_true]
         beams = kind.decode(this, following)
@@ -316,9 +339,10 @@ class Rplidar(SpinningLidar):
         most_q6 = MOST_HZ * 360 * 64 * kind.samples * 500e-6  # no RPLIDAR takes longer than 500 us for a sample
         can_be = is_next & (span_q6 > 0) & (span_q6 < min(most_q6, 180 * 64)) & (start_q6 < CIRCLE_Q6)
         is_true = np.zeros_like(can_be)
+        tolerance = STRICT_SPAN if self._is_strict else LOOSE_SPAN
         for k in np.flatnonzero(can_be).tolist():
             change = abs(span_q6[k] - self._usual_span_q6)
-            is_true[k] = change <= SPAN_TOLERANCE * self._usual_span_q6 + 4
+            is_true[k] = change <= tolerance * self._usual_span_q6 + 2
             self._strange_spans = 0 if is_true[k] else self._strange_spans + 1
             if is_true[k]:
                 self._usual_span_q6 += 0.2 * (span_q6[k] - self._usual_span_q6)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hw import hokuyo, ld06, rplidar_wire, sick_lms, xv11, ydlidar
+from hw import hokuyo, ld06, rplidar_hq, rplidar_wire, sick_lms, xv11, ydlidar
 from hw.driver import Driver
 from hw.hokuyo import Hokuyo
 from hw.ld06 import Ld06
@@ -133,6 +133,18 @@ def rplidar_capsules(kind_type: int, seconds: float = 2.0, hz: float = 10.0) -> 
     return Stream(f"rplidar-{kind_type:#x}", Rplidar, b"".join(out) * round(seconds * hz), seconds, prefix)
 
 
+def rplidar_hq_frames(seconds: float = 2.0, rate: int = 9600, hz: float = 10.0) -> Stream:
+    """The HQ answers: 96 beams with their own angles."""
+    per_turn = round(rate / hz)
+    out = []
+    for first in range(0, round(seconds * rate), rplidar_hq.BEAMS):
+        counts = np.round((first + np.arange(rplidar_hq.BEAMS)) % per_turn * 65536 / per_turn)
+        angle_deg = counts * rplidar_hq.DEG_PER_COUNT
+        out.append(rplidar_hq.encode(list(angle_deg), list(_mm(angle_deg))))
+    prefix = rplidar_wire.Descriptor(rplidar_hq.FRAME_BYTES, True, rplidar_wire.HQ_TYPE).encode()
+    return Stream("rplidar-0x83", Rplidar, b"".join(out), seconds, prefix)
+
+
 def ydlidar_packets(model: str = "g4", sample_bytes: int = 2, seconds: float = 2.0, rate: int = 5000, hz: float = 10.0) -> Stream:
     """Packets of 40 samples, a start packet each turn; angles corrected as the triangle models ask."""
     per_turn = round(rate / hz)
@@ -188,6 +200,7 @@ STREAMS: dict[str, Callable[..., Stream]] = {
     "stl27l": lambda **kw: ldrobot("stl27l", **kw),
     "rplidar-0x81": rplidar_nodes,
     "rplidar-0x82": lambda **kw: rplidar_capsules(0x82, **kw),
+    "rplidar-0x83": rplidar_hq_frames,
     "rplidar-0x84": lambda **kw: rplidar_capsules(0x84, **kw),
     "rplidar-0x85": lambda **kw: rplidar_capsules(0x85, **kw),
     "rplidar-0x86": lambda **kw: rplidar_capsules(0x86, **kw),
