@@ -92,6 +92,7 @@ SCHEMAS: dict[type, tuple[Field, ...]] = {
         Field("T_map_robot", "T", optional(TRANSFORM), None),
         Field("is_frozen", "F", FLAG, False),
         Field("load", "L", real(0.0, 1.0), 0.0),
+        Field("known_area_m2", "a", _AREA, 0.0),
     ),
     m.MapAnnouncement: (
         *_HEAD,

@@ -76,11 +76,12 @@ class Beat:
     T_map_robot: SE2 | None = None
     is_frozen: bool = False
     load: float = 0.0  # share of its work time that is used, 0 to 1
+    known_area_m2: float = 0.0  # of `map`: how much it has grown
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapAnnouncement:
-    """There is a new revision of my map, and these are its features."""
+    """My map has features worth knowing; said again when it has grown, not at every revision: `Beat.map` tells those."""
 
     robot: str
     boot: int

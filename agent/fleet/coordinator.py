@@ -114,6 +114,7 @@ class Coordinator:
         self._T_map_robot: SE2 | None = None
         self._clock = _Clock()
         self._beat_seq = 0
+        self._announced_m2 = 0.0
         self._next_beat_s = self._next_announce_s = self._next_scan_s = self._next_hello_s = -1e18
         self._scan_from = 0
         self._twin: _Twin | None = None
@@ -494,7 +495,10 @@ class Coordinator:
         assert own.version is not None and own.announcement is not None
         if before is not None and before.frame != own.version.frame:
             self._on_new_frame(self.robot, now_s)
-        self._ledger.send(own.announcement)
+        is_new_frame = before is None or before.frame != own.version.frame
+        if is_new_frame or own.known_area_m2 > self._announced_m2 * (1.0 + self.options.announce_growth):
+            self._announced_m2 = own.known_area_m2
+            self._ledger.send(own.announcement)
         self._next_scan_s = min(self._next_scan_s, now_s)
 
     def _beat(self, now_s: float) -> None:
@@ -515,6 +519,8 @@ class Coordinator:
                 held.id() if held else NO_DIGEST,
                 self._T_map_robot,
                 self.options.is_frozen,
+                0.0,
+                self._ledger.own.known_area_m2,
             )
         )
         if self._next_hello_s <= now_s:
@@ -555,7 +561,7 @@ class Coordinator:
             return
         if not self._ledger.is_trusted(peer.robot, now_s):
             return
-        if beat.map is not None and (peer.announcement is None or peer.announcement.map != peer.map):
+        if beat.map is not None and (peer.announcement is None or peer.announcement.map.frame != beat.map.frame):
             self._fetching.want(peer.robot, "feat", "map/feat", now_s)
         if peer.beat_s >= peer.said_s and beat.edges_digest != statements_digest(peer.statements.values()):
             self._fetching.want(peer.robot, "edges", "edges", now_s)

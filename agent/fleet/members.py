@@ -69,6 +69,8 @@ class Peer:
 
     @property
     def known_area_m2(self) -> float:
+        if self.beat is not None and self.beat.map is not None and self.beat.map == self.map:
+            return self.beat.known_area_m2
         return self.announcement.known_area_m2 if self.announcement else 0.0
 
     @property

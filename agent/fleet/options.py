@@ -15,7 +15,8 @@ class FleetOptions:
     max_beats_per_s: float = 40.0  # larger fleets beat slower, so that a robot never hears more than this
     suspect_after_beats: float = 4.0
     lost_after_s: float = 15.0  # network stalls of 10 s are normal and mean nothing
-    announce_period_s: float = 2.0  # a growing map is announced at most this often
+    announce_period_s: float = 2.0  # a growing map is published at most this often; beats carry its version
+    announce_growth: float = 0.10  # and its features are sent again when it has grown by this share
     pull_period_s: float = 2.0  # a growing map of one peer is pulled at most this often
     compose_period_s: float = 2.0  # the global map is composed at most this often
     fetch_timeout_s: float = 40.0  # a runtime that never answers a Fetch is not waited for longer

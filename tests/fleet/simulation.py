@@ -22,7 +22,7 @@ from agent.fleet.consistency import agreement
 from agent.fleet.coordinator import Coordinator
 from agent.fleet.effects import Changed, Effect, Fetch, Fuse, Match, MatchKind, Note, Send
 from agent.fleet.options import FleetOptions
-from agent.merging.fusion import fuse
+from agent.merging.fusion import FusedMap, fuse
 from agent.merging.result import MatchFactor, MatchStatus, MergeResult
 from protocol.channels import chunk_register
 from protocol.codec import decode, encode
@@ -168,6 +168,7 @@ class Fleet:
         self.blocked: set[tuple[str, str]] = set()  # one-way cuts
         self._events: list[tuple[float, int, Callable[[], None]]] = []
         self._order = itertools.count()
+        self._fusions: dict[tuple[object, ...], FusedMap] = {}
 
     # Robots.
 
@@ -337,10 +338,17 @@ class Fleet:
 
         def finish() -> None:
             if node.life == life and node.coordinator is not None:
-                fused = fuse(job.maps, job.resolution_m)
+                fused = self._fused(job)
                 self.carry_out(node, node.coordinator.on_fused(job, fused, self.local_s(node)))
 
         self.at(self.rng.uniform(0.02, 0.2), finish)
+
+    def _fused(self, job: Fuse) -> FusedMap:
+        """`fuse`, once for all robots that follow one recipe: it is a pure function."""
+        key = (job.resolution_m, *((grid.content_hash(), T) for grid, T in job.maps))
+        if key not in self._fusions:
+            self._fusions[key] = fuse(job.maps, job.resolution_m)
+        return self._fusions[key]
 
     # The network.
 

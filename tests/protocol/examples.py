@@ -72,7 +72,7 @@ def examples() -> dict[str, Message]:
     meta = GlobalMeta(*head, 9, "amber", 0.05, members, (bytes(8),), bytes(range(16)), 12, 3456)
     return {
         "hello": Hello(*head, 12.5, 1, 1, "mapquilt 0.1", 0.05, False, ("tcp/10.0.0.7:7447",)),
-        "beat": Beat(*head, 77, 80.25, 1.0, ours, bytes(range(8)), bytes(range(16)), SE2(1.0, 2.0, -0.5), False, 0.25),
+        "beat": Beat(*head, 77, 80.25, 1.0, ours, bytes(range(8)), bytes(range(16)), SE2(1.0, 2.0, -0.5), False, 0.25, 42.5),
         "feat": MapAnnouncement(*head, ours, 0.05, 42.5, 2345, features()),
         "coarse": CoarseMap(*head, ours, small_grid()),
         "fine": FineTiles(*head, ours, whole),
