@@ -27,7 +27,7 @@ from agent.runtime.exchange import ExchangeError
 from agent.runtime.log_setup import set_up_logging
 from agent.runtime.network import NetworkConfigError
 from agent.runtime.node import Node
-from agent.view.server import ViewServer
+from agent.view.server import ViewServer, ViewSource
 from hw.errors import DeviceConfigError
 
 log = logging.getLogger(__name__)
@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     node = make_node(with_devices(config), keeps_state=not args.no_state)
     stopping.then(node.stopping.set)
     with exit_watchdog(node.stopping), running(node), contextlib.ExitStack() as stack:
-        page = serve_page(node, config) if config.view.enabled else None
+        page = serve_page(node.keeper, config) if config.view.enabled else None
         if page is not None:
             stack.callback(page.close)
         if args.ready_json:
@@ -111,12 +111,12 @@ def running(node: Node) -> Any:
         node.stop()
 
 
-def serve_page(node: Node, config: Config) -> ViewServer | None:
+def serve_page(source: ViewSource, config: Config) -> ViewServer | None:
     """The page on the wished port, or on the next free one; a robot without a page is still a robot."""
     wished = config.view.port
     for port in range(wished, wished + PORTS_TRIED) if wished else (0,):
         try:
-            page = ViewServer(node.keeper, port, config.view.host)
+            page = ViewServer(source, port, config.view.host)
         except (OSError, OverflowError):
             continue
         page.start()

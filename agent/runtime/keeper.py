@@ -7,7 +7,6 @@ session is opened anew, with the configured seeds and the addresses learnt since
 from __future__ import annotations
 
 import base64
-import json
 import logging
 import threading
 import time
@@ -18,6 +17,7 @@ from agent.fleet.state import Presence
 from agent.runtime import snapshot as snapshots
 from agent.runtime.control import ControlError, Handler
 from agent.runtime.latest import Latest
+from agent.runtime.metrics import metrics
 from protocol.geometry import SE2
 from protocol.grid import OccupancyGrid
 from protocol.tiles import pack_cells, unpack_cells
@@ -162,7 +162,8 @@ class Keeper:
         return snapshots.grid_of(self._node, name)
 
     def metrics(self) -> str:
-        return json.dumps(self.status())
+        """The same for Prometheus."""
+        return metrics(self.status())
 
     def summary(self) -> str:
         """One line for the service manager."""
