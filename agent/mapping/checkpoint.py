@@ -116,7 +116,7 @@ def search_state(mapper: Mapper) -> State:
     search = mapper.search
     if search is None:
         return {"search.stamp_s": math.nan}
-    return {"search.stamp_s": search.stamp_s, "search.points_m": search.points_m, "search.next_heading": search.next_heading}
+    return {"search.stamp_s": search.stamp_s, "search.surfels": search.surfels, "search.next_heading": search.next_heading}
 
 
 def filter_state(mapper: Mapper) -> State:
@@ -200,7 +200,7 @@ def put_state(mapper: Mapper, state: State) -> None:
 def put_search(mapper: Mapper, state: State) -> None:
     if math.isnan(state["search.stamp_s"]):
         return
-    mapper.search = mapper.map.search_for(state["search.points_m"], state["search.stamp_s"])
+    mapper.search = mapper.map.search_for(state["search.surfels"], state["search.stamp_s"])
     while mapper.search.next_heading < state["search.next_heading"]:
         mapper.search.step()
 

@@ -57,7 +57,7 @@ class LocalMap:
             step = deviation = UNKNOWN_MOTION
         predicted = self.predicted(motion)
         fields, particle = self.filter.fields, self.filter.followed
-        return track(fields, particle, self.drawing.coarse, predicted, step, deviation, points.matching_m)
+        return track(fields, particle, self.drawing.coarse, predicted, step, deviation, points.surfels)
 
     def predicted(self, motion: Motion) -> NDArray[np.float64]:
         return as_array(as_pose(self.pose) @ motion.T_from_to)
@@ -99,16 +99,16 @@ class LocalMap:
         """A keyframe seen from `pose`: every particle matches and draws it, and so does the grid."""
         motion = as_array(as_pose(self.keyframe_pose).inverse() @ as_pose(pose))
         deviation_m, deviation_rad = np.sqrt(self.keyframe_variance)
-        self.filter.update(motion, (float(deviation_m), float(deviation_rad)), points.matching_m, points.surface_m)
+        self.filter.update(motion, (float(deviation_m), float(deviation_rad)), points.surfels, points.surface_m)
         self.drawing.add(points, self.filter.line[-1])
         self.drawing.follow(self.filter.line)
         self.keyframe_s = points.stamp_s
         self.keyframe_pose = self.filter.poses[self.filter.followed].copy()
         self.keyframe_variance = np.zeros(2)
 
-    def search_for(self, points_m: NDArray[np.float32], stamp_s: float) -> Relocalization:
+    def search_for(self, surfels: NDArray[np.float32], stamp_s: float) -> Relocalization:
         """A search for a scan on the whole map."""
-        return Relocalization(self.drawing.coarse, points_m, stamp_s)
+        return Relocalization(self.drawing.coarse, surfels, stamp_s)
 
     def move_to(self, pose: NDArray[np.float64], stamp_s: float) -> None:
         """The robot was found again: everything goes on from here."""

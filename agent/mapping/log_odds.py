@@ -20,6 +20,7 @@ UNIT = 127 / 4.0  # cell values per unit of log-odds
 HIT = 27  # +0.85: one end point makes a new cell occupied
 PASS = -13  # -0.4: three beams in a row make a new cell free, five clear a walker's single trace
 NOTHING, PASSED, ENDED = 0, 1, 2
+BEFORE_END_M = 0.3  # a beam that crosses a wall this far before its end should not have
 SUBPIXEL_BITS = 3  # cv2 draws rays from sub-cell starts to sub-cell ends
 
 
@@ -95,11 +96,27 @@ class LogOddsGrid:
 
     def is_free(self, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
         """(N,) whether map-frame points lie in cells known to be free."""
+        return self._values(points_m) <= self.free_to
+
+    def is_behind_wall(self, laser_m: tuple[float, float], points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """(N,) whether the beam to a point passes an occupied cell well before it ends."""
+        ray = points_m - np.array(laser_m)
+        length = np.hypot(ray[:, 0], ray[:, 1])
+        steps = np.arange(1, int(length.max() / self.resolution_m) + 1)[:, None] * self.resolution_m  # (S, 1) metres
+        before = steps < length - BEFORE_END_M
+        at, of = np.nonzero(before)
+        along = np.array(laser_m) + ray[of] * (steps[at] / length[of, None])
+        behind = np.zeros(len(points_m), bool)
+        behind[of[self._values(along) >= self.occupied_from]] = True
+        return behind
+
+    def _values(self, points_m: NDArray[np.float64]) -> NDArray[np.int8]:
+        """(N,) cell values under map-frame points; 0 outside."""
         cells = np.floor(points_m[:, ::-1] / self.resolution_m).astype(np.int64) - self.first_tile * TILE_CELLS
         inside = (cells >= 0).all(axis=1) & (cells < self.cells.shape).all(axis=1)
-        free = np.zeros(len(points_m), bool)
-        free[inside] = self.cells[cells[inside, 0], cells[inside, 1]] <= self.free_to
-        return free
+        values = np.zeros(len(points_m), np.int8)
+        values[inside] = self.cells[cells[inside, 0], cells[inside, 1]]
+        return values
 
     def copy(self) -> LogOddsGrid:
         twin = LogOddsGrid(self.resolution_m)

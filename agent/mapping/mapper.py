@@ -23,13 +23,14 @@ from agent.mapping.motion import Motion, OdometryTrack
 from agent.mapping.options import MappingOptions
 from agent.mapping.relocalization import Relocalization
 from agent.mapping.scan_matching import UNCONSTRAINED_RATIO
-from agent.mapping.scan_points import ScanPoints, reference_stamp_s, scan_points
+from agent.mapping.scan_points import ScanPoints, laser_position_m, reference_stamp_s, scan_points
 from agent.mapping.tracking import GOOD_FRACTION, Tracked
 from hw.readings import LaserScan, Odometry
 from protocol.grid import OccupancyGrid
 
 FEWEST_POINTS = 20  # fewer returns than this say nothing about where the robot is
-CONTRADICTED = 0.35  # share of a scan that ends in known free space: a crowd of people stays below
+UNEXPLAINED = 0.1  # field value: 13 cm from the nearest wall
+CONTRADICTED = 0.35  # share of a scan that the map rules out; a crowd of people stays below
 LOST_AFTER = 5  # scans in a row that contradict the map before the robot looks for itself elsewhere
 CONFIRMED_AFTER = 5  # scans in a row that fit, after it found itself, before it draws again
 NEW_MAP_AFTER_S = 10.0  # of looking everywhere in vain
@@ -102,9 +103,11 @@ class Mapper:
         return self.map.steady_motion(points.stamp_s)
 
     def _contradiction(self, points: ScanPoints, tracked: Tracked) -> float:
-        """Share of the scan's points that lie in space known to be free: new rooms are no contradiction, moved walls are."""
-        seen = self.map.drawing.grid.is_free(as_pose(tracked.pose).apply(points.matching_m))
-        return float(np.mean(seen & (tracked.likelihood < 0.1)))
+        """Share of the scan that cannot be so: ends in space known to be free, or behind a wall.  New rooms can."""
+        T_map_robot = as_pose(tracked.pose)
+        grid, ends_m = self.map.drawing.grid, T_map_robot.apply(points.matching_m)
+        cannot = grid.is_free(ends_m) | grid.is_behind_wall(laser_position_m(self.options, T_map_robot), ends_m)
+        return float(np.mean(cannot & (tracked.likelihood < UNEXPLAINED)))
 
     def _contradicted(self, points: ScanPoints, tracked: Tracked) -> ScanOutcome:
         self.contradictions += 1
@@ -116,7 +119,7 @@ class Mapper:
     def _look_everywhere(self, points: ScanPoints) -> ScanOutcome:
         """Lost: a few headings of the search per scan; found, or after a while a new map."""
         if self.search is None:
-            self.search = self.map.search_for(points.matching_m, points.stamp_s)
+            self.search = self.map.search_for(points.surfels, points.stamp_s)
         self.search.step()
         if self.search.is_done:
             found = self.search.answer(self.map.filter.fields, self.map.filter.followed)

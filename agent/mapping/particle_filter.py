@@ -67,7 +67,7 @@ class ParticleFilter:
         self,
         motion: NDArray[np.float64],
         deviation: tuple[float, float],
-        points_m: NDArray[np.float32],
+        surfels: NDArray[np.float32],
         surface_m: NDArray[np.float32],
     ) -> Fit:
         """One keyframe: motion (3,) in the robot frame since the last one, one sigma of it, points to match and to draw."""
@@ -75,10 +75,10 @@ class ParticleFilter:
         noise = self.rng.standard_normal((self.particles, 3)) * PREDICTION_NOISE
         noise[0] = 0.0  # one particle follows the tracked motion exactly
         self.poses = predicted + noise
-        self._cover(points_m)
+        self._cover(surface_m)
         everyone = np.arange(self.particles)
         prior = np.broadcast_to(information(*deviation), (self.particles, 3, 3))
-        fit = refine(self.fields, everyone, self.poses, predicted, prior, points_m)
+        fit = refine(self.fields, everyone, self.poses, predicted, prior, surfels)
         self.poses = fit.poses + self._spread(fit, prior)
         self._weigh(fit)
         self._stamp(surface_m)

@@ -31,8 +31,8 @@ CLEARLY_BETTER = 0.12  # than the best other place: two equal rooms give no answ
 class Relocalization:
     """The search for one scan's place; `step` until `is_done`."""
 
-    def __init__(self, coarse: CoarseField, points_m: NDArray[np.float32], stamp_s: float) -> None:
-        self.points_m = points_m
+    def __init__(self, coarse: CoarseField, surfels: NDArray[np.float32], stamp_s: float) -> None:
+        self.surfels = surfels
         self.stamp_s = stamp_s
         self.field = halved(coarse.blurred(coarse.first, coarse.first + coarse.empty.shape))
         self.first_m = coarse.first[::-1] * COARSE_M  # (x, y) of the field's corner
@@ -45,7 +45,7 @@ class Relocalization:
 
     def step(self) -> None:
         """Score a few more headings everywhere."""
-        points = coarse_points(self.points_m, CELL_M)
+        points = coarse_points(self.surfels[:, :2], CELL_M)
         for heading in range(self.next_heading, min(self.next_heading + HEADINGS_A_CALL, HEADINGS)):
             theta = heading * math.tau / HEADINGS - math.pi
             self.peaks += self._peaks(points, theta)
@@ -72,11 +72,11 @@ class Relocalization:
         """(3,) the robot's pose when the scan was made; None when nothing fits, or several places do."""
         self.peaks.sort(key=lambda peak: -peak[0])
         starts = np.array([peak[1:] for peak in self.peaks[:CANDIDATES]])
-        reach_m = float(np.hypot(*self.points_m.T).max()) + 2.0
+        reach_m = float(np.hypot(self.surfels[:, 0], self.surfels[:, 1]).max()) + 2.0
         fields.cover(starts[:, :2].min(axis=0) - reach_m, starts[:, :2].max(axis=0) + reach_m)
         n = len(starts)
         weak = np.broadcast_to(information(1.0, 0.5), (n, 3, 3))
-        fit = refine(fields, np.full(n, particle), starts, starts, weak, self.points_m, iterations=10)
+        fit = refine(fields, np.full(n, particle), starts, starts, weak, self.surfels, iterations=10)
         fractions = fit.fractions()
         best = int(np.argmax(fractions))
         others = fractions[[is_elsewhere(fit.poses[best], pose) for pose in fit.poses]]

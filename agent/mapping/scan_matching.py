@@ -19,6 +19,7 @@ ITERATIONS = 4
 MAX_STEP = np.array([0.15, 0.15, 0.1])  # metres, metres, radians: a wilder step has left the basin
 PRIOR_GAIN = 0.3  # neighbouring beams repeat one another, but odometry errs in the same direction again and again
 FLAT_SLOPE = np.float32(1.0)  # per metre: below it a slope is rounding, not the direction of a wall
+LONE_WEIGHT = np.float32(0.25)  # of a point without a normal: far down a corridor they are dots that move along with the robot
 ARM_M = 5.0  # a radian counts as this many metres when directions are compared
 UNCONSTRAINED_RATIO = 0.02  # weakest to strongest curvature; a bare corridor with a few door frames has about 0.01
 
@@ -44,38 +45,51 @@ def refine(
     poses: Poses,
     priors: Poses,
     weights: NDArray[np.float64],
-    points_m: NDArray[np.float32],
+    surfels: NDArray[np.float32],
     iterations: int = ITERATIONS,
 ) -> Fit:
     """Gauss-Newton from (P, 3) poses, each held by its prior with information (P, 3, 3), in the fields of (P,) particles."""
     poses = poses.copy()
     for _ in range(iterations):
-        value, jacobian = linearised(fields, particles, poses, points_m)
-        pull = jacobian.sum(axis=2, dtype=np.float64) + np.einsum("pij,pj->pi", weights, difference(priors, poses))
-        step = np.linalg.solve(curvature_of(fields, value, jacobian) + weights, pull[:, :, None])[:, :, 0]
+        _, pull, curvature = linearised(fields, particles, poses, surfels)
+        pull = pull + np.einsum("pij,pj->pi", weights, difference(priors, poses))
+        step = np.linalg.solve(curvature + weights, pull[:, :, None])[:, :, 0]
         poses += np.clip(step, -MAX_STEP, MAX_STEP)
-    value, jacobian = linearised(fields, particles, poses, points_m)
-    return Fit(poses, value, curvature_of(fields, value, jacobian))
-
-
-def curvature_of(fields: TiledFields, value: NDArray[np.float32], jacobian: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(P, 3, 3) second derivative of sum L, as if every point were pulled to its wall by a spring of stiffness L / sigma^2.
-
-    The field's own slope vanishes on the wall, so only its direction is used: Gauss-Newton on 1 - L halves the error in
-    each step, this one removes it.
-    """
-    slope = jacobian[:, 0] ** 2 + jacobian[:, 1] ** 2 + FLAT_SLOPE**2
-    stiffness = value / (slope * np.float32(fields.sigma_m**2))
-    return np.asarray(np.einsum("pim,pjm->pij", jacobian * stiffness[:, None], jacobian), np.float64)
+    value, _, curvature = linearised(fields, particles, poses, surfels)
+    return Fit(poses, value, curvature)
 
 
 def linearised(
-    fields: TiledFields, particles: NDArray[np.int64], poses: Poses, points_m: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Field value (P, M) under every point and its derivative (P, 3, M) by the pose."""
-    x, y, arm_x, arm_y = placed(poses, points_m)
+    fields: TiledFields, particles: NDArray[np.int64], poses: Poses, surfels: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]:
+    """Field value (P, M) under every point, slope (P, 3) of their sum by the pose, and its curvature (P, 3, 3).
+
+    Each point is pulled to its wall by a spring of stiffness L / sigma^2 along the normal that the scan itself shows: the
+    field's ripple along a wall holds nothing back.  Points without one (corners, lone ones) follow the field's slope.
+    Gauss-Newton on 1 - L would only halve the error in each step, for the field is flat on the wall; this one removes it.
+    """
+    x, y, arm_x, arm_y = placed(poses, surfels)
     value, slope_x, slope_y = fields.look_up(particles, x, y)
-    return value, np.stack([slope_x, slope_y, slope_y * arm_x - slope_x * arm_y], axis=1)
+    normal_x, normal_y = turned_normals(poses, surfels)
+    lone = np.flatnonzero((surfels[:, 2] == 0) & (surfels[:, 3] == 0))
+    if len(lone):
+        length = np.sqrt(slope_x[:, lone] ** 2 + slope_y[:, lone] ** 2 + FLAT_SLOPE**2)
+        normal_x[:, lone], normal_y[:, lone] = slope_x[:, lone] / length, slope_y[:, lone] / length
+    slope, held = slope_x * normal_x + slope_y * normal_y, value.copy()
+    direction = np.stack([normal_x, normal_y, normal_y * arm_x - normal_x * arm_y], axis=1)  # (P, 3, M)
+    if len(lone):
+        slope[:, lone] *= LONE_WEIGHT
+        held[:, lone] *= LONE_WEIGHT
+    stiffness = held * np.float32(fields.sigma_m**-2)
+    curvature = np.einsum("pim,pjm->pij", direction * stiffness[:, None], direction)
+    return value, np.einsum("pim,pm->pi", direction, slope).astype(np.float64), curvature.astype(np.float64)
+
+
+def turned_normals(poses: Poses, surfels: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(P, M) x and y of the normals in the map frame."""
+    cos = np.cos(poses[:, 2:]).astype(np.float32)
+    sin = np.sin(poses[:, 2:]).astype(np.float32)
+    return cos * surfels[:, 2] - sin * surfels[:, 3], sin * surfels[:, 2] + cos * surfels[:, 3]
 
 
 def placed(poses: Poses, points_m: NDArray[np.float32]) -> tuple[NDArray[np.float32], ...]:

@@ -22,6 +22,8 @@ FAR = 2.4  # ... up to this many times as far: 60 m
 FACING_GAP_M = 0.4  # two neighbouring hits farther apart may be two things ...
 WIDEST_GAP_M = 1.0  # ... unless a third lies in line with them
 STRAIGHT = np.float32(0.985)  # cosine of 10 degrees
+STRAIGHT_CHORD = np.float32(0.8)  # cosine: chords that bend by more than 37 degrees meet in a corner
+MOST_SURFELS = 180  # beams 2 degrees apart say what can be said; four times as many cost four times the time
 STEEPEST = 0.85  # change of range per gap: beyond it the surface is seen so flat that it may be a depth jump
 
 
@@ -32,13 +34,18 @@ class ScanPoints:
     stamp_s: float
     points_m: NDArray[np.float32]  # (N, 2) every return, cut rays included
     is_hit: NDArray[np.bool_]  # (N,) False: the ray was cut at the matching range, something lies further on
-    matching_m: NDArray[np.float32]  # (M, 2) hits, one a voxel
+    surfels: NDArray[np.float32]  # (M, 4) hits to match, one a voxel: x, y, and the unit normal there, (0, 0) where unknown
     surface_m: NDArray[np.float32]  # (K, 2) hits and the surfaces between neighbouring ones, one a voxel
     is_partial: bool
 
     @property
     def n(self) -> int:
         return len(self.points_m)
+
+    @property
+    def matching_m(self) -> NDArray[np.float32]:
+        """(M, 2) x and y of the surfels."""
+        return self.surfels[:, :2]
 
 
 def reference_stamp_s(scan: LaserScan) -> float:
@@ -62,7 +69,8 @@ def scan_points(scan: LaserScan, track: OdometryTrack, options: MappingOptions) 
     is_hit = ranges[is_return] < reach_m
     ends = points.astype(np.float32)
     hits = one_per_voxel(ends[is_hit])
-    return ScanPoints(stamp_s, ends, is_hit, hits, one_per_voxel(np.vstack([hits, between(ends, is_hit, cut)])), scan.is_partial)
+    surface = one_per_voxel(np.vstack([hits, between(ends, is_hit, cut)]))
+    return ScanPoints(stamp_s, ends, is_hit, thinned(with_normals(hits), MOST_SURFELS), surface, scan.is_partial)
 
 
 def matching_reach_m(returns_m: NDArray[np.float64], options: MappingOptions) -> float:
@@ -80,12 +88,49 @@ def between(ends_m: NDArray[np.float32], is_hit: NDArray[np.bool_], ranges_m: ND
     """
     step_m = ends_m[1:] - ends_m[:-1]
     gap_m = np.hypot(step_m[:, 0], step_m[:, 1])
-    is_facing = (gap_m < FACING_GAP_M) & (np.abs(np.diff(ranges_m)) < STEEPEST * gap_m)
-    is_surface = (is_facing | goes_on_straight(step_m, gap_m)) & is_hit[1:] & is_hit[:-1]
+    is_surface = is_joined(step_m, gap_m, ranges_m) & is_hit[1:] & is_hit[:-1]
     inner = np.where(is_surface, np.ceil(gap_m / VOXEL_M) - 1, 0).astype(np.int64)
     first = np.repeat(np.arange(len(gap_m)), inner)
     share = (np.arange(len(first)) - np.repeat(np.cumsum(inner) - inner, inner) + 1) / (inner[first] + 1)
     return (ends_m[first] + share[:, None].astype(np.float32) * (ends_m[first + 1] - ends_m[first])).astype(np.float32)
+
+
+def is_joined(
+    step_m: NDArray[np.float32], gap_m: NDArray[np.float32], ranges_m: NDArray[np.float64] | NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """(N - 1,) whether neighbouring points lie on one surface."""
+    is_facing = (gap_m < FACING_GAP_M) & (np.abs(np.diff(ranges_m)) < STEEPEST * gap_m)
+    return is_facing | goes_on_straight(step_m, gap_m)
+
+
+def with_normals(hits_m: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(M, 4) points in beam order with the normal of the chord from two points before to two after; none at corners."""
+    n = len(hits_m)
+    surfels = np.zeros((n, 4), np.float32)
+    surfels[:, :2] = hits_m
+    if n < 3:
+        return surfels
+    step_m = hits_m[1:] - hits_m[:-1]
+    joined = np.zeros(n + 3, bool)  # joined[i + 2]: point i and point i + 1
+    joined[2 : n + 1] = is_joined(step_m, np.hypot(step_m[:, 0], step_m[:, 1]), np.hypot(hits_m[:, 0], hits_m[:, 1]))
+    i = np.arange(n)
+    before = np.where(joined[i + 1], np.where(joined[i], 2, 1), 0)
+    after = np.where(joined[i + 2], np.where(joined[i + 3], 2, 1), 0)
+    back, ahead = hits_m - hits_m[i - before], hits_m[i + after] - hits_m
+    bend = (back * ahead).sum(axis=1) < STRAIGHT_CHORD * np.hypot(back[:, 0], back[:, 1]) * np.hypot(ahead[:, 0], ahead[:, 1])
+    chord = back + ahead
+    length = np.hypot(chord[:, 0], chord[:, 1])
+    is_wall = (before + after > 1) & ~bend & (length > 0.5 * VOXEL_M)
+    surfels[is_wall, 2] = -chord[is_wall, 1] / length[is_wall]
+    surfels[is_wall, 3] = chord[is_wall, 0] / length[is_wall]
+    return surfels
+
+
+def thinned(rows: NDArray[np.float32], most: int) -> NDArray[np.float32]:
+    """At most that many rows, evenly spread."""
+    if len(rows) <= most:
+        return rows
+    return rows[np.arange(most) * len(rows) // most]
 
 
 def goes_on_straight(step_m: NDArray[np.float32], gap_m: NDArray[np.float32]) -> NDArray[np.bool_]:

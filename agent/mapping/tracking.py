@@ -44,20 +44,20 @@ def track(
     predicted: NDArray[np.float64],
     step: tuple[float, float],
     deviation: tuple[float, float],
-    points_m: NDArray[np.float32],
+    surfels: NDArray[np.float32],
 ) -> Tracked:
     """The pose near `predicted` that fits best; `step` is how far the robot moved (metres, radians), `deviation` one sigma."""
     weights = information(*deviation)
-    reach_m = float(np.hypot(*points_m.T).max()) + 2.0
+    reach_m = float(np.hypot(surfels[:, 0], surfels[:, 1]).max()) + 2.0
     fields.cover(predicted[:2] - reach_m, predicted[:2] + reach_m)
     starts = predicted[None]
-    best = best_fit(fields, particle, starts, predicted, weights, points_m)
+    best = best_fit(fields, particle, starts, predicted, weights, surfels)
     is_small = step[0] < SMALL_STEP_M and step[1] < SMALL_STEP_RAD
     for reach in (NEAR_REACH, WIDE_REACH):
         if best.fraction >= GOOD_FRACTION and (is_small or reach is WIDE_REACH):
             break
-        starts, _ = coarse.best_poses(predicted, points_m, *reach, STARTS)
-        best = better(best, best_fit(fields, particle, starts, predicted, weights, points_m))
+        starts, _ = coarse.best_poses(predicted, surfels[:, :2], *reach, STARTS)
+        best = better(best, best_fit(fields, particle, starts, predicted, weights, surfels))
     return best
 
 
@@ -71,12 +71,12 @@ def best_fit(
     starts: Poses,
     predicted: NDArray[np.float64],
     weights: NDArray[np.float64],
-    points_m: NDArray[np.float32],
+    surfels: NDArray[np.float32],
 ) -> Tracked:
     """Gauss-Newton from every start; the best end."""
     n = len(starts)
     priors = np.broadcast_to(predicted, (n, 3))
-    fit = refine(fields, np.full(n, particle), starts, priors, np.broadcast_to(weights, (n, 3, 3)), points_m)
+    fit = refine(fields, np.full(n, particle), starts, priors, np.broadcast_to(weights, (n, 3, 3)), surfels)
     scores = fit.likelihood.sum(axis=1, dtype=np.float64) - objections(fit.poses, predicted, weights)
     i = int(np.argmax(scores))
     ratio, _ = weakest_direction(fit.curvature[i])
@@ -86,4 +86,4 @@ def best_fit(
 def objections(poses: Poses, predicted: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
     """(P,) what odometry holds against each pose, in points that must fit to outweigh it."""
     d = difference(poses, np.broadcast_to(predicted, poses.shape))
-    return np.minimum(0.5 * np.einsum("pi,ij,pj->p", d, weights, d), LARGEST_OBJECTION)
+    return np.asarray(np.minimum(0.5 * np.einsum("pi,ij,pj->p", d, weights, d), LARGEST_OBJECTION))
