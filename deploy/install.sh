@@ -20,6 +20,7 @@ What goes where:
   /etc/systemd/system/mapquilt@.service       the service
   /etc/udev/rules.d/90-mapquilt.rules         who may use the serial ports
   /etc/modules-load.d/mapquilt.conf           serial drivers, there before the first plug
+  /usr/local/share                            TAB completion for bash, and the man page
 TEXT
 }
 
@@ -50,6 +51,8 @@ command=$root/usr/local/bin/mapquilt
 unit=$root/etc/systemd/system/mapquilt@.service
 rules=$root/etc/udev/rules.d/90-mapquilt.rules
 drivers=$root/etc/modules-load.d/mapquilt.conf
+completion=$root/usr/local/share/bash-completion/completions/mapquilt
+page=$root/usr/local/share/man/man1/mapquilt.1
 
 # Commands for the running system: not when the files go somewhere else.
 live() { [ -z "$root" ] && command -v "$1" >/dev/null 2>&1; }
@@ -120,9 +123,17 @@ place_system() {
     mkdir -p "${drivers%/*}" "${command%/*}"
     printf '%s\n' usbserial cdc_acm >"$drivers"
     ln -sfn /opt/mapquilt/.venv/bin/mapquilt "$command"
+    place_help
     ! live modprobe || modprobe -a usbserial cdc_acm 2>/dev/null || true
     ! live udevadm || { udevadm control --reload && udevadm trigger --subsystem-match=tty; } 2>/dev/null || true
     ! systemd_runs || systemctl daemon-reload
+}
+
+place_help() {
+    [ -x "$home/.venv/bin/mapquilt" ] || return 0
+    mkdir -p "${completion%/*}" "${page%/*}"
+    "$home/.venv/bin/mapquilt" completion bash >"$completion"
+    "$home/.venv/bin/mapquilt" completion man >"$page"
 }
 
 start_service() {
@@ -140,7 +151,7 @@ uninstall() {
         systemctl list-units --all --plain --no-legend 'mapquilt@*' | while read -r name _; do systemctl disable --now "$name" || true; done
     fi
     rm -rf "$home"
-    rm -f "$command" "$unit" "$rules" "$drivers"
+    rm -f "$command" "$unit" "$rules" "$drivers" "$completion" "$page"
     ! systemd_runs || systemctl daemon-reload
     if [ "$purge" = yes ]; then
         rm -rf "$settings" "$root/var/lib/mapquilt" "$root/var/lib/private/mapquilt"

@@ -35,6 +35,7 @@ PORT_THIEVES = {  # program: why it must not be there
     "ModemManager": ("sends modem commands to every new port", "sudo systemctl disable --now ModemManager"),
     "brltty": ("takes CP210x and CH340 adapters for braille displays", "sudo apt-get remove brltty"),
 }
+IFF_UP, IFF_MULTICAST = 0x1, 0x1000
 THROTTLED = Path("sys/devices/platform/soc/soc:firmware/get_throttled")
 UNDERVOLTED_NOW, UNDERVOLTED_ONCE = 1 << 0, 1 << 16
 EXPIRES_WITHIN_S = 30 * 24 * 3600
@@ -200,6 +201,22 @@ def view(machine: Machine) -> Iterator[Finding]:
     yield ok("page", f"{settings.host}:{settings.port} is free")
 
 
+def network(machine: Machine) -> Iterator[Finding]:
+    """Robots on one LAN find one another by multicast."""
+    if machine.config.fleet.profile != "lan":
+        return
+    interfaces = {path.parent.name: _flags(path) for path in (machine.root / "sys/class/net").glob("*/flags")}
+    able = sorted(name for name, flags in interfaces.items() if flags & IFF_UP and flags & IFF_MULTICAST and name != "lo")
+    if able:
+        yield ok("network", f"multicast over {', '.join(able)}")
+    elif machine.config.fleet.connect:
+        yield ok("network", f"no multicast, so only {', '.join(machine.config.fleet.connect)} are dialled")
+    else:
+        yield Finding(
+            Level.WARN, "network", "no network interface can multicast: robots will not find one another", "ip link show up"
+        )
+
+
 def security(machine: Machine) -> Iterator[Finding]:
     fleet = machine.config.fleet
     if fleet.security == "open":
@@ -240,7 +257,7 @@ def running_robot(machine: Machine) -> Iterator[Finding]:
 
 
 CHECKS: tuple[Check, ...] = (
-    python, packages, memory, power, descriptors, state, serial_ports, port_thieves, view, security, running_robot,
+    python, packages, memory, power, descriptors, state, serial_ports, port_thieves, network, view, security, running_robot,
 )  # fmt: skip
 
 
@@ -272,6 +289,10 @@ def _certificate(path: Path) -> Finding:
     if done.returncode:
         return Finding(Level.WARN, "security", f"{path} expires on {end}", "mapquilt fleet enroll keys ROBOT")
     return ok("security", f"{path} is valid until {end}")
+
+
+def _flags(path: Path) -> int:
+    return int(_read(path).strip() or "0", 16)
 
 
 def _read(path: Path) -> str:

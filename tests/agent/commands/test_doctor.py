@@ -118,6 +118,18 @@ def test_a_page_whose_port_is_taken(machine: Machine) -> None:
     assert "in use" in finding.finding
 
 
+def test_a_lan_needs_multicast(machine: Machine) -> None:
+    assert list(checks.network(machine)) == []
+    lan = changed(machine, fleet=FleetConfig(profile="lan"))
+    for name, flags in (("lo", "0x49"), ("wlan0", "0x1002"), ("eth0", "0x1003")):
+        (machine.root / "sys/class/net" / name).mkdir(parents=True)
+        (machine.root / "sys/class/net" / name / "flags").write_text(flags + "\n")
+        assert only(checks.network, lan).level is (Level.OK if name == "eth0" else Level.WARN)
+    (machine.root / "sys/class/net/eth0/flags").write_text("0x0\n")
+    dialled = changed(machine, fleet=FleetConfig(profile="lan", connect=("tcp/10.0.0.1:7447",)))
+    assert only(checks.network, dialled).level is Level.OK
+
+
 def test_security_that_is_none(machine: Machine) -> None:
     assert only(checks.security, machine).level is Level.OK
     assert only(checks.security, changed(machine, fleet=FleetConfig(profile="lan"))).level is Level.WARN
