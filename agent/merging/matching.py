@@ -11,7 +11,7 @@ from agent.merging.refinement import FINE_GATES_M, normal_equations, refined
 from agent.merging.result import Alternative, MatchOptions, MergeResult, Reason
 from agent.merging.search import FIRST_PASS, SECOND_PASS, search
 from agent.merging.transforms import Poses, to_se2
-from agent.merging.validation import evidence, match_factor
+from agent.merging.validation import doubts, evidence, match_factor
 from agent.merging.verdict import Grounds, rival_score, verdict
 from agent.merging.views import side, witness
 from protocol.geometry import SE2
@@ -63,6 +63,7 @@ def _judged(ours: MapSnapshot, theirs: MapSnapshot, poses: Poses, tried: int, op
         float(found.observability_m[best]),
         factor.value,
         max(ours.working.resolution_m, theirs.working.resolution_m),
+        *doubts(witness(ours), witness(theirs), poses[best]),
     )
     status, reason = verdict(grounds, options)
     return MergeResult(

@@ -33,10 +33,9 @@ class Reason:
     LITTLE_WALL = "little common wall"
     LOW_MATCH_FACTOR = "low match factor"
     CONFLICTS = "walls conflict"
-    CROSSING_WALLS = "walls cross free space"
     UNOBSERVABLE = "unobservable direction"
     RIVAL = "second best as good"
-    OPEN_RIVAL = "second best not ruled out"
+    LOOK_ALIKE = "looks like another place of the same kind"
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,6 +6,7 @@ alternative decides first.  The paper's match factor is a gate: true transforms 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,8 +22,9 @@ MIN_AGREEING_SHARE = 0.5  # of firm wall that says anything; half is a bar that 
 MIN_YIELD = 0.15  # score per metre it would be without anything against
 MIN_OBSERVABILITY_M = 2.0
 MIN_AGREEING_M = 8.0
-FINE_FACTOR = 0.90  # match factor at 10 cm below which look-alike corridors lie; coarse cells disagree more at the truth,
-FACTOR_SLOPE = 0.4  # by this a metre of cell
+USUAL_FACTOR = 0.95  # of true transforms at 10 cm
+FACTOR_SLOPE = 0.4  # coarser cells disagree more at the truth, by this a metre of cell
+MAX_SUSPICION = 1.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,9 +39,22 @@ class Grounds:
     observability_m: float
     factor: float
     cell_m: float
+    attached_doubt: float
+    deep_doubt: float
+
+    @property
+    def suspicion(self) -> float:
+        """How much this looks like another place of the same kind.
+
+        A building laid on its own mirror image agrees over a hundred metres of wall without any rival.  What gives it away is
+        what a building does not repeat: small things along the walls, straight walls deep in free space, and the match
+        factor.  The weights are those that tell mirrored recordings from true pairs; the optimum is flat.
+        """
+        factor = self.factor + FACTOR_SLOPE * max(0.0, self.cell_m - 0.1)
+        return 13.0 * (USUAL_FACTOR - factor) + math.sqrt(min(self.attached_doubt, 0.5)) + 1.6 * math.sqrt(self.deep_doubt)
 
     def numbers(self) -> dict[str, float]:
-        return {name: float(getattr(self, name)) for name in self.__slots__}
+        return {name: float(getattr(self, name)) for name in (*self.__slots__, "suspicion")}
 
 
 def verdict(grounds: Grounds, options: MatchOptions) -> tuple[MatchStatus, str]:
@@ -49,12 +64,14 @@ def verdict(grounds: Grounds, options: MatchOptions) -> tuple[MatchStatus, str]:
         return MatchStatus.NO, Reason.LITTLE_WALL
     if g.agreeing_m <= MIN_AGREEING_SHARE * (g.agreeing_m + g.against_m) or g.score <= MIN_YIELD * g.potential_m:
         return MatchStatus.NO, Reason.CONFLICTS
-    if g.factor < max(options.min_match_factor, FINE_FACTOR - FACTOR_SLOPE * max(0.0, g.cell_m - 0.1)):
+    if g.factor < options.min_match_factor:
         return MatchStatus.NO, Reason.LOW_MATCH_FACTOR
     if g.observability_m <= MIN_OBSERVABILITY_M:
         return MatchStatus.AMBIGUOUS, Reason.UNOBSERVABLE
     if g.score - g.rival <= options.min_margin_m or g.rival >= MAX_RIVAL_SHARE * g.score:
         return MatchStatus.AMBIGUOUS, Reason.RIVAL
+    if g.suspicion > MAX_SUSPICION:
+        return MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE
     return MatchStatus.MERGED, Reason.MATCHED
 
 
