@@ -44,10 +44,7 @@ def _ydlidar(url: DeviceUrl) -> Driver:
 
 def _hokuyo(url: DeviceUrl) -> Driver:
     url.only((*COMMON, "intensity", "free"))
-    driver = Hokuyo(url.integer("intensity", 0, 0, 1) == 1, url.integer("free", 0, 0, 1) == 1)
-    if "range_min" in url.options or "range_max" in url.options:
-        return _limited(driver, url)
-    return driver
+    return _limited(Hokuyo(url.integer("intensity", 0, 0, 1) == 1, url.integer("free", 0, 0, 1) == 1), url)
 
 
 def _sick(url: DeviceUrl) -> Driver:
@@ -66,7 +63,8 @@ def _neato(kind: Kind) -> Build:
 
 
 def _limited(driver: SpinningLidar | Hokuyo | SickLms, url: DeviceUrl) -> Driver:
-    driver.limit(url.number("range_min", driver.range_min_m), url.number("range_max", driver.range_max_m))
+    if "range_min" in url.options or "range_max" in url.options:
+        driver.limit(url.number("range_min", driver.range_min_m), url.number("range_max", driver.range_max_m))
     return driver
 
 

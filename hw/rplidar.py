@@ -23,6 +23,7 @@ from hw.spinning import STRICT_ABOVE, Floats, Ints, SpinningLidar, carried
 
 BAUDS = (115200, 460800, 256000, 1000000)
 RANGE_MIN_M, RANGE_MAX_M = 0.05, 40.0
+SERIES_RANGE_M = {1: 12.0, 2: 18.0, 3: 25.0, 4: 16.0, 5: 16.0, 6: 40.0, 7: 30.0, 8: 40.0}  # data sheets: A1 A2 A3 C1 C2 S1 S2 S3
 DEFAULT_PWM, DEFAULT_RPM = 660, 600
 MODES = {"standard": wire.NODE_TYPE, "express": wire.EXPRESS_TYPE, "dense": wire.DENSE_TYPE}
 MODES |= {"ultra": wire.ULTRA_TYPE, "ultradense": wire.ULTRA_DENSE_TYPE, "hq": wire.HQ_TYPE}
@@ -48,9 +49,15 @@ class Rplidar(SpinningLidar):
         self._conf: wire.Conf | None = None
         self._board_flag: int | None = None
         self._single: wire.Descriptor | None = None
+        self._is_limited = False
         self._nodes = NodeFinder()
         self._capsules: dict[int, FixedFrames] = {kind: frames_of(KINDS[kind]) for kind in KINDS}
         self._restart_stream()
+
+    def limit(self, range_min_m: float, range_max_m: float) -> None:
+        """Believe only ranges within these limits, whatever the data sheet says."""
+        super().limit(range_min_m, range_max_m)
+        self._is_limited = True
 
     def restart(self) -> None:
         """See `Driver.restart`."""
@@ -222,6 +229,8 @@ class Rplidar(SpinningLidar):
         if kind == wire.INFO_TYPE and (info := wire.Info.decode(body)):
             self.info = info
             self.identity.model, self.identity.serial = info.name, info.serial.hex().upper()
+            if not self._is_limited:
+                self._assembler.range_max_m = SERIES_RANGE_M.get(info.series, RANGE_MAX_M)
             self.identity.firmware = f"{info.firmware[0]}.{info.firmware[1]:02d}"
         elif kind == wire.HEALTH_TYPE:
             self.health = wire.Health.decode(body)
