@@ -1,0 +1,89 @@
+"""Twenty real robot processes in one simulated building: do all of them end up in one map, and what does it cost?
+
+    .venv/bin/python -m tests.campaigns.twenty_robots [--robots 20] [--minutes 8] [--json]
+
+Bars (RELIABILITY.md, C11): all merged into one global map with one digest, at most 120 MB resident each.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from tests.harness.fleet import Fleet
+
+MAX_RSS_MB = 120.0
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--robots", type=int, default=20)
+    parser.add_argument("--minutes", type=float, default=8.0)
+    parser.add_argument("--particles", type=int, default=10, help="few, since all share this machine's cores")
+    parser.add_argument("--world", default="office")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", action="store_true")
+    args = parser.parse_args(argv)
+    figures = campaign(args)
+    if args.json:
+        print(json.dumps(figures))
+    else:
+        print("| " + " | ".join(figures) + " |\n|" + " --- |" * len(figures))
+        print("| " + " | ".join(f"{v:.1f}" if isinstance(v, float) else str(v) for v in figures.values()) + " |")
+    return 0 if figures["one map"] and figures["largest RSS MB"] <= MAX_RSS_MB else 1
+
+
+def campaign(args: argparse.Namespace) -> dict[str, Any]:
+    with Fleet() as fleet:
+        stage = fleet.stage(args.world, robots=args.robots, seed=args.seed)
+        for actor in stage.robots:
+            fleet.start(actor, arguments=["--set", f"mapping.particles={args.particles}", "--no-state"])
+            print(f"up: {actor.name}", file=sys.stderr)
+        stage.begin()
+        started = time.monotonic()
+        names, merged_s, most = [actor.name for actor in stage.robots], None, 0
+        rss_mb = 0.0
+        while time.monotonic() - started < 60 * args.minutes:
+            statuses = [fleet.status(name) for name in names]
+            fused = [status.get("global") or {} for status in statuses]
+            digests = {one.get("digest") for one in fused}
+            members = max((len(one.get("members", [])) for one in fused), default=0)
+            rss_mb = max(rss_mb, *(resident_mb(fleet.agents[name].process.pid) for name in names))
+            if members > most:
+                most = members
+                print(f"{time.monotonic() - started:5.0f} s: {most} robots in one map, {rss_mb:.0f} MB", file=sys.stderr)
+            if most == args.robots and len(digests) == 1:
+                merged_s = time.monotonic() - started
+                break
+            time.sleep(1.0)
+        statuses = [fleet.status(name) for name in names]
+    mappings = [status["mapping"] for status in statuses if status]
+    return {
+        "robots": args.robots,
+        "in one map": most,
+        "one map": merged_s is not None,
+        "seconds to one digest everywhere": merged_s,
+        "largest RSS MB": rss_mb,
+        "scans": sum(m["scans"] for m in mappings),
+        "scans lost": sum(m["scans_lost"] for m in mappings),
+        "worker errors": sum(w["errors"] for status in statuses if status for w in status["workers"]),
+        "largest inbox drops": max((status["network"]["inbox_dropped"] for status in statuses if status), default=0),
+    }
+
+
+def resident_mb(pid: int) -> float:
+    try:
+        for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+            if line.startswith("VmRSS:"):
+                return int(line.split()[1]) / 1024
+    except OSError:
+        return 0.0
+    return 0.0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
