@@ -198,9 +198,8 @@ def pair_picture(merged: Merged, pair: Pair) -> NDArray[np.uint8]:
     kinds["lines"] = same.lines[longest_first]
     ours = _to_draw(a, {kind: rows[:, 0].tolist() for kind, rows in kinds.items()})
     theirs = _to_draw(b, {kind: rows[:, 1].tolist() for kind, rows in kinds.items()})
-    return merge_picture(
-        ours, theirs, _overlay(a, b, T), merged.verdict(pair), [*_figures(result), f"{len(same)} matched features"]
-    )
+    verdict = merged.verdict(pair) + ("" if result.accepted else "; below, the best hypothesis")
+    return merge_picture(ours, theirs, _overlay(a, b, T), verdict, [*_figures(result), f"{len(same)} matched features"])
 
 
 def _to_draw(loaded: LoadedMap, matched: Mapping[str, list[int]]) -> MapToDraw:

@@ -13,11 +13,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.grid import OCCUPIED, OccupancyGrid
+from protocol.grid import OCCUPIED, UNKNOWN, OccupancyGrid
 
 PAPER_COLUMNS = ("x_m", "y_m", "size_m", "orientation_rad")  # orientation in [0, pi): lines of the paper have no direction
 FeatureRows = NDArray[np.float64]  # (N, 4)
 
+MAX_WALL_CELLS = 120_000  # three times a 250 m campus at 10 cm
 _LINE_THICKNESS_CELLS = 3  # cells either side of a Hough line that belong to it
 _LINE_COVERED = 0.5  # share of a line that must still be there when its turn comes: else it is a duplicate
 _CIRCLE_COVERED = 0.4
@@ -55,6 +56,7 @@ DEFAULTS = PaperFeatureOptions()
 
 def paper_features(grid: OccupancyGrid, options: PaperFeatureOptions = DEFAULTS) -> PaperFeatures:
     """Section II of the paper: lines, circles and remaining curves of the occupied cells."""
+    grid = _with_bounded_walls(grid)
     remaining = ((grid.cells == OCCUPIED) * 255).astype(np.uint8)
     if not remaining.any():
         return PaperFeatures()
@@ -62,6 +64,15 @@ def paper_features(grid: OccupancyGrid, options: PaperFeatureOptions = DEFAULTS)
     circles = _hough_circles(remaining, grid.resolution_m, options)
     curves = _remaining_curves(remaining, grid.resolution_m, options)
     return PaperFeatures(*(_in_map_frame(rows, grid, options.max_per_kind) for rows in (lines, circles, curves)))
+
+
+def _with_bounded_walls(grid: OccupancyGrid) -> OccupancyGrid:
+    """The grid with cells twice as large, again and again, until the Hough transforms have a bounded number to look at."""
+    while np.count_nonzero(grid.cells == OCCUPIED) > MAX_WALL_CELLS:
+        cells = np.pad(grid.cells, [(0, side % 2) for side in grid.cells.shape], constant_values=UNKNOWN)
+        pairs = np.maximum(cells[::2], cells[1::2])  # OCCUPIED is the largest value, so a wall stays a wall
+        grid = OccupancyGrid(np.maximum(pairs[:, ::2], pairs[:, 1::2]), 2 * grid.resolution_m, grid.origin)
+    return grid
 
 
 def _hough_lines(remaining: NDArray[np.uint8], cell_m: float, options: PaperFeatureOptions) -> list[list[float]]:

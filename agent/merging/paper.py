@@ -30,6 +30,8 @@ from protocol.grid import OccupancyGrid
 TRANSLATION_BIN_M = 0.2  # the paper's cell
 MAX_ROTATIONS = 30  # most frequent first; each is tried as theta and theta + 180 degrees
 MAX_TRANSLATIONS = 40  # most frequent first, for each rotation
+MIN_TRANSLATIONS = 3
+MAX_CELLS_COUNTED = 4_000_000_000  # over all candidates: maps beyond 1.6 million cells get fewer, to end within seconds
 _ROW = 1 << 32  # packs two bins into one integer, which sorts ten times faster than pairs
 
 
@@ -80,9 +82,10 @@ def paper_candidates(ours: OccupancyGrid, theirs: OccupancyGrid, options: MatchO
     """Every transform voted for, with its match factor."""
     pairs = similar_features(paper_features(ours), paper_features(theirs), options.size_tolerance)
     counter = FactorCounter.of(ours, theirs)
+    affordable = max(MIN_TRANSLATIONS, round(MAX_CELLS_COUNTED / (2 * MAX_ROTATIONS * max(1, ours.cells.size))))
     candidates = []
     for theta_rad in rotation_candidates(pairs, options.rotation_bin_deg):
-        for T_ours_theirs in translation_candidates(pairs, theta_rad):
+        for T_ours_theirs in translation_candidates(pairs, theta_rad, min(MAX_TRANSLATIONS, affordable)):
             candidates.append(Candidate(T_ours_theirs, counter.at(T_ours_theirs)))
     return candidates
 
@@ -113,12 +116,12 @@ def rotation_candidates(pairs: SimilarFeatures, bin_deg: float) -> Iterator[floa
         yield math.radians(index * bin_deg) + math.pi
 
 
-def translation_candidates(pairs: SimilarFeatures, theta_rad: float) -> Iterator[SE2]:
+def translation_candidates(pairs: SimilarFeatures, theta_rad: float, limit: int = MAX_TRANSLATIONS) -> Iterator[SE2]:
     """Differences of centres once theirs are turned by theta, most frequent first."""
     T_ours_turned = SE2(0.0, 0.0, theta_rad)
     shifts_m = pairs.ours[:, :2] - T_ours_turned.apply(pairs.theirs[:, :2])
     bins = np.rint(shifts_m / TRANSLATION_BIN_M).astype(np.int64)
-    for code in _most_frequent(bins[:, 0] * _ROW + bins[:, 1], MAX_TRANSLATIONS):
+    for code in _most_frequent(bins[:, 0] * _ROW + bins[:, 1], limit):
         x, y = (code + _ROW // 2) // _ROW, (code + _ROW // 2) % _ROW - _ROW // 2
         yield SE2(x * TRANSLATION_BIN_M, y * TRANSLATION_BIN_M, wrap_angle(theta_rad))
 

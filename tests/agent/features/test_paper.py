@@ -73,6 +73,14 @@ def test_no_cells_whatever_upset_it(cells):
         assert np.isfinite(kind).all()
 
 
+def test_walls_beyond_any_building_are_looked_at_more_coarsely():
+    dust = np.where(np.random.default_rng(0).random((1500, 1500)) < 0.1, OCCUPIED, FREE).astype(np.int8)
+    cv2.line(dust, (100, 100), (1400, 100), OCCUPIED, 3)
+    features = paper_features(OccupancyGrid(dust, 0.05))
+    assert len(features) <= 3 * 120
+    assert features.lines[0, 2] > 5
+
+
 def test_a_checkerboard_is_bounded_work():
     cells = np.where(np.indices((300, 300)).sum(axis=0) % 2, OCCUPIED, FREE).astype(np.int8)
     assert len(paper_features(OccupancyGrid(cells, 0.05))) <= 3 * 120
