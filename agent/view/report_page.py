@@ -25,7 +25,7 @@ REASONS = {  # reason code: what it means for the person who reads it
     "walls conflict": "one robot saw walls where the other saw free space",
     "walls cross free space": "one robot saw free space through the other's walls",
     "unobservable direction": "the common walls are parallel: the maps could slide along them",
-    "looks like another place of the same kind": "the common walls are of a kind that such buildings have everywhere: more map will tell",
+    "looks like another place of the same kind": "such walls stand in many places of such a building: more map will tell",
     "second best as good": "there is a second place that fits as well: the building repeats itself, more map will tell",
     "second best not ruled out": "there is a second place that is not ruled out yet: more map will tell",
 }
