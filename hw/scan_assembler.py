@@ -206,8 +206,13 @@ def supported_only(ranges_m: Floats, steps: tuple[int, ...] = (1,)) -> Floats:
 UNEVEN_RAD = np.radians(0.13)  # one step of an express capsule's offsets; 1 cm at 5 m
 
 
-def is_evenly_spaced(angles_rad: Floats) -> NDArray[np.bool_]:
-    """Which beams lie midway between their neighbours in angle: where a device sends angles, they too can be damaged."""
-    step = np.remainder(angles_rad - _turned(angles_rad, 1) + np.pi, 2 * np.pi) - np.pi
-    even: NDArray[np.bool_] = np.abs(_turned(step, -1) - step) <= 2 * UNEVEN_RAD
+def is_evenly_spaced(angles_rad: Floats, steps: tuple[int, ...] = (1, 3)) -> NDArray[np.bool_]:
+    """Which beams lie midway between their neighbours in angle: where a device sends angles, they too can be damaged.
+
+    Two neighbours damaged alike would bear one another out; the ones three steps away do not.
+    """
+    even = np.ones(len(angles_rad), bool)
+    for step in steps:
+        before = np.remainder(angles_rad - _turned(angles_rad, step) + np.pi, 2 * np.pi) - np.pi
+        even &= np.abs(_turned(before, -step) - before) <= 2 * UNEVEN_RAD
     return even

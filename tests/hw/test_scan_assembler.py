@@ -61,7 +61,9 @@ def test_a_slanting_wall_supports_its_beams_and_an_edge_does_not() -> None:
 def test_an_angle_out_of_line_is_seen() -> None:
     angles = -np.radians(np.arange(0.0, 360.0))
     angles[100] += np.radians(2.0)
-    assert np.flatnonzero(~is_evenly_spaced(angles)).tolist() == [99, 100, 101]
+    assert np.flatnonzero(~is_evenly_spaced(angles, (1,))).tolist() == [99, 100, 101]
+    angles[99] += np.radians(1.0)  # half of its neighbour's error: it lies midway again
+    assert is_evenly_spaced(angles, (1,))[99] and not is_evenly_spaced(angles)[99]
 
 
 def test_coverage_counts_what_is_missing() -> None:
