@@ -1,4 +1,4 @@
-"""`mapquilt localize GIVEN.yaml [LOCAL.yaml]`: where does a small map lie in a big one, and where is the robot in it?
+"""`mapquilt localize [LOCAL.yaml] GIVEN.yaml`: where does a small map lie in a big one, and where is the robot in it?
 
 The kidnapped robot's question.  The small map is a file, or what the running robot has drawn since it woke up.
 """
@@ -24,18 +24,18 @@ from agent.view.render import png
 from protocol.geometry import SE2
 
 EXAMPLES = """\
-  mapquilt localize building.yaml room.yaml           room.yaml's frame in building.yaml's; exit code 0: found, 1: not
-  mapquilt localize building.yaml room.yaml --json    the same as one JSON object
+  mapquilt localize room.yaml building.yaml           room.yaml's frame in building.yaml's; exit code 0: found, 1: not
+  mapquilt localize room.yaml building.yaml --json    the same as one JSON object
   mapquilt localize building.yaml                     the robot that runs here: where is it in the building?
-  mapquilt localize building.yaml room.yaml -o where.png
+  mapquilt localize room.yaml building.yaml -o where.png
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("given", type=Path, metavar="GIVEN.yaml", help="the big map")
     parser.add_argument(
         "local", type=Path, nargs="?", metavar="LOCAL.yaml", help="the small map (default: the running robot's own)"
     )
+    parser.add_argument("given", type=Path, metavar="GIVEN.yaml", help="the big map")
     parser.add_argument("--robot", metavar="ID", help="which robot, when several run here")
     parser.add_argument("--json", action="store_true", help="one JSON object")
     parser.add_argument("-o", "--output", type=Path, metavar="FILE.png", help="draw both maps and what matched")

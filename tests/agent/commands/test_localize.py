@@ -21,7 +21,7 @@ def test_a_part_is_found_in_the_whole(run: Run, office: Path, tmp_path: Path) ->
     local = floor_plan()
     part = OccupancyGrid(np.ascontiguousarray(local.cells[:, 150:]), 0.05, SE2(100.0, 50.0, 0.7))
     save_map(part, tmp_path / "part")
-    ended = run("localize", office, tmp_path / "part.yaml", "--json", "-o", tmp_path / "where.png")
+    ended = run("localize", tmp_path / "part.yaml", office, "--json", "-o", tmp_path / "where.png")
     assert ended.code == 0
     found = json.loads(ended.out)
     T_expected = local.origin @ SE2(7.5, 0.0, 0.0) @ part.origin.inverse()
@@ -35,10 +35,10 @@ def test_a_part_is_found_in_the_whole(run: Run, office: Path, tmp_path: Path) ->
 
 def test_what_is_not_there_is_not_found(run: Run, office: Path, tmp_path: Path) -> None:
     save_map(OccupancyGrid(np.full((100, 100), FREE, np.int8), 0.05), tmp_path / "hall")
-    ended = run("localize", office, tmp_path / "hall.yaml")
+    ended = run("localize", tmp_path / "hall.yaml", office)
     assert ended.code == 1
     assert ended.out.startswith("not found: hall.yaml in office.yaml: ")
-    assert json.loads(run("localize", office, tmp_path / "hall.yaml", "--json").out)["found"] is False
+    assert json.loads(run("localize", tmp_path / "hall.yaml", office, "--json").out)["found"] is False
 
 
 def test_the_running_robot_is_told_where_it_is(run: Run, office: Path, robot: Callable[..., FakeRobot]) -> None:
