@@ -45,7 +45,6 @@ class Browser:
         program = chromium()
         assert program is not None
         words = ["--headless=new", "--no-sandbox", "--disable-gpu", "--remote-debugging-port=0", f"--user-data-dir={profile}"]
-        silent = subprocess.DEVNULL
         size = f"--window-size={self._size[0]},{self._size[1]}"
         self._process = subprocess.Popen(
             [program, *words, size, "about:blank"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
