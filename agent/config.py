@@ -68,7 +68,9 @@ class MappingConfig:
     resolution_m: float = setting(0.05, low=0.01, high=1.0)  # halving it costs four times the memory and the messages
     particles: int = setting(30, low=1, high=1000)  # time per scan grows in proportion; 30 is what the bars are measured with
     seed: int = setting(0, low=0, high=2**63 - 1)  # the same readings and seed give the same map, to the bit
-    max_range_m: float = setting(0.0, low=0.0, high=500.0)  # farther returns are ignored; 0: the LIDAR's own range
+    max_range_m: float = setting(
+        0.0, low=0.0, high=500.0
+    )  # farther returns are ignored; 0: 25 m, beyond which beams cost time only
 
 
 @dataclass(frozen=True, slots=True)
