@@ -13,7 +13,7 @@ from agent.features.structure import ATTACHED, LOOSE, SHORT
 from agent.features.wall_points import SPACING_M, WallPoints
 from agent.features.working import WorkingGrid
 from agent.merging.result import MatchFactor
-from agent.merging.scoring import AGREES, CONFLICTS, CROSSES, Probe, outcome_table, placed, readings, worth_table
+from agent.merging.scoring import AGREES, CONFLICTS, CROSSES, OPPOSITE, Probe, outcome_table, placed, readings, worth_table
 from agent.merging.transforms import Poses, inverted
 
 OUTCOMES = np.tile(outcome_table().ravel(), 4)
@@ -71,19 +71,25 @@ def _one_way(points: Witness, on: Witness, poses: Poses) -> tuple[NDArray[np.flo
     return tuple(np.asarray(v, np.float64) * SPACING_M for v in sums)
 
 
-def doubts(ours: Witness, theirs: Witness, pose: NDArray[np.float64]) -> tuple[float, float]:
-    """Attached wall that conflicts, per metre of it that agrees; and straight wall deep in free space, per metre of firm wall."""
-    attached, deep, agreeing = np.zeros(2), 0.0, 0.0
+def doubts(ours: Witness, theirs: Witness, pose: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Signs of another place of the same kind, each per metre that agrees.
+
+    Attached wall that conflicts, straight wall deep in free space, and firm wall whose free side is the other one.
+    """
+    attached, deep, opposite, agreeing = np.zeros(2), 0.0, 0.0, 0.0
     for points, on, T in ((theirs, ours, pose[None]), (ours, theirs, inverted(pose[None]))):
         outcome = OUTCOMES.take(readings(on.field.fine, on.field.resolution_m, points.probe, T))[0]
         clutter = points.kinds == ATTACHED
         attached += [np.count_nonzero(clutter & (outcome == what)) for what in (CONFLICTS, AGREES)]
-        agreeing += np.count_nonzero((points.kinds != LOOSE) & (outcome == AGREES))
+        firm = points.kinds != LOOSE
+        agreeing += np.count_nonzero(firm & (outcome == AGREES))
+        opposite += np.count_nonzero(firm & (outcome == OPPOSITE))
         alone = (points.kinds >= SHORT) & (outcome == CONFLICTS)
         x, y = placed(points.probe.xy1[:, alone], T, on.field.resolution_m)
         away = cv2.remap(on.field.distance_m, x, y, cv2.INTER_NEAREST, borderValue=0) if alone.any() else np.zeros(0)
         deep += np.count_nonzero(away > DEEP_M)
-    return float(attached[0] / max(attached[1], 0.5)), float(deep / max(agreeing, 0.5))
+    agreeing = max(agreeing, 0.5)
+    return float(attached[0] / max(attached[1], 0.5)), float(deep / agreeing), float(opposite / agreeing)
 
 
 def match_factor(ours: WorkingGrid, theirs: WorkingGrid, pose: NDArray[np.float64]) -> tuple[MatchFactor, float]:

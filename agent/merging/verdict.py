@@ -25,6 +25,7 @@ MIN_AGREEING_M = 8.0
 USUAL_FACTOR = 0.95  # of true transforms at 10 cm
 FACTOR_SLOPE = 0.4  # coarser cells disagree more at the truth, by this a metre of cell
 MAX_SUSPICION = 1.1
+MAX_OPPOSITE_SHARE = 0.5  # thin walls seen from both sides make 0.1 to 0.4; a mirrored plan 0.6 to 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +42,7 @@ class Grounds:
     cell_m: float
     attached_doubt: float
     deep_doubt: float
+    opposite_share: float
 
     @property
     def suspicion(self) -> float:
@@ -70,7 +72,7 @@ def verdict(grounds: Grounds, options: MatchOptions) -> tuple[MatchStatus, str]:
         return MatchStatus.AMBIGUOUS, Reason.UNOBSERVABLE
     if g.score - g.rival <= options.min_margin_m or g.rival >= MAX_RIVAL_SHARE * g.score:
         return MatchStatus.AMBIGUOUS, Reason.RIVAL
-    if g.suspicion > MAX_SUSPICION:
+    if g.suspicion > MAX_SUSPICION or g.opposite_share > MAX_OPPOSITE_SHARE:
         return MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE
     return MatchStatus.MERGED, Reason.MATCHED
 

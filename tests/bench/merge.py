@@ -1,0 +1,108 @@
+"""Merging on the evaluation kit: how many pairs merge, how many wrongly, how exactly and how fast, beside other methods.
+
+BENCH_DATA=/root/bench/data-2024 .venv/bin/python -m tests.bench.merge                       ours, all sets
+BENCH_DATA='/root/bench/data-{seed}' .venv/bin/python -m tests.bench.merge --seeds 2024 11 12
+.venv/bin/python -m tests.bench.merge --adapters mapquilt paper fmt arw fft seed seed-guarded --stride 4
+.venv/bin/python -m tests.bench.merge --json out.json
+
+The kit is ../shared/bench (or MAPQUILT_SHARED); its README says what is in the sets and how success is judged.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+REPO = Path(__file__).resolve().parents[2]
+SHARED = Path(os.environ.get("MAPQUILT_SHARED", REPO.parent / "shared"))
+OURS = {
+    "mapquilt": "agent.merging.adapter:merge",
+    "paper": "agent.merging.adapter:merge_like_the_paper",
+    "paper-guarded": "agent.merging.adapter:merge_guarded",
+}
+KIT = ("seed", "seed-guarded", "fft", "arw", "fmt")
+SETS = ("main", "res20", "degraded")
+HEAD = (
+    "| method | seed | set | pos / neg | merged, right % | best hypothesis right % | wrong merges | R@P100 % "
+    "| error median (95 %) cm | deg | CPU s median (95 %) |"
+)
+
+
+def main() -> None:
+    args = _arguments()
+    if not (SHARED / "bench").is_dir():
+        sys.exit(f"{SHARED}/bench: no evaluation kit there; set MAPQUILT_SHARED to the folder that holds bench/")
+    for path in (SHARED, REPO):
+        sys.path.insert(0, str(path))
+    os.environ["PYTHONPATH"] = os.pathsep.join([str(SHARED), str(REPO), os.environ.get("PYTHONPATH", "")])
+    from bench import metrics, runner  # noqa: PLC0415  # type: ignore[import-not-found]
+
+    runs = []
+    print(HEAD + "\n" + "|---" * 11 + "|", flush=True)
+    for adapter in args.adapters:
+        for seed in args.seeds:
+            for which in args.sets:
+                folder = Path(args.data.format(seed=seed)) / which
+                run = _run(runner, folder, adapter, args)
+                run.update(seed=seed, wrong=[r["id"] for r in run["rows"] if r["accepted"] and not r["correct"]])
+                runs.append(run)
+                print(_row(run), flush=True)
+    for by in ("log", "bin", "res", "degrade", "corridor"):
+        print(f"\n### merged, right % by {by} (w: wrong merges)\n\n{metrics.matrix(runs, by)}")
+    if args.json:
+        slim = [{k: v for k, v in run.items() if k != "rows"} for run in runs]
+        Path(args.json).write_text(json.dumps(slim, indent=1, default=float))
+
+
+def _arguments() -> argparse.Namespace:
+    default = os.environ.get("BENCH_DATA", str(Path.home() / ".cache/mapquilt-bench/data"))
+    parser = argparse.ArgumentParser(prog="tests.bench.merge", description=__doc__.splitlines()[0])  # type: ignore[union-attr]
+    parser.add_argument("--adapters", nargs="+", default=["mapquilt"], choices=[*OURS, *KIT])
+    parser.add_argument("--seeds", nargs="+", default=["2024"], help="fills {seed} in --data")
+    parser.add_argument("--data", default=default, help="where the sets lie (default: BENCH_DATA)")
+    parser.add_argument("--sets", nargs="+", default=list(SETS))
+    parser.add_argument("--stride", type=int, default=1, help="every n-th pair")
+    parser.add_argument("--timeout", type=float, default=300.0)
+    parser.add_argument("--json", metavar="FILE", help="also write everything but the rows as JSON")
+    return parser.parse_args()
+
+
+def _run(runner: Any, folder: Path, adapter: str, args: argparse.Namespace) -> dict[str, Any]:
+    with tempfile.TemporaryDirectory() as scratch:
+        run: dict[str, Any] = runner.run(
+            str(folder),
+            OURS.get(adapter, adapter),
+            f"{scratch}/run.json",
+            adapter,
+            args.timeout,
+            stride=args.stride,
+            verbose=False,
+        )
+    return run
+
+
+def _row(run: dict[str, Any]) -> str:
+    import numpy as np  # noqa: PLC0415
+
+    s, good = run["summary"], [r for r in run["rows"] if r["accepted"] and r["correct"]]
+
+    def pair(key: str, scale: float, digits: int) -> str:
+        if not good:
+            return "-"
+        median, worst = np.percentile([r[key] for r in good], [50, 95]) * scale
+        return f"{median:.{digits}f} ({worst:.{digits}f})"
+
+    return (
+        f"| {run['adapter']} | {run['seed']} | {run['set']} | {s['pos']} / {s['neg']} | **{100 * s['success']:.1f}** "
+        f"| {100 * s['hypothesis']:.1f} | {s['n_wrong']} | {100 * s['recall_p100']:.1f} | {pair('err_t', 100, 1)} "
+        f"| {pair('err_r', 1, 3)} | {s['cpu_med']:.2f} ({s['cpu_p95']:.2f}) |"
+    )
+
+
+if __name__ == "__main__":
+    main()
