@@ -8,6 +8,7 @@ from __future__ import annotations
 import queue
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 from agent.mapping.estimate import MapEstimate
 from agent.mapping.mapper import Mapper
@@ -32,6 +33,9 @@ class MapWorker:
         self._readings = readings
         self._period_s = estimate_period_s
         self._next_estimate_s = 0.0
+        # A map saved before this computer was started again bears later stamps than its clock now gives.
+        saved_s = mapper.estimate().stamp_s
+        self._shift_s = saved_s + 1.0 - time.monotonic() if saved_s > time.monotonic() else 0.0
         self._calls: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
 
     def call(self, action: Callable[[], None]) -> None:
@@ -43,11 +47,11 @@ class MapWorker:
             self._calls.get()()
         odometry, scan = self._readings.take(WAIT_S, WAIT_FOR_ODOMETRY_S)
         for sample in odometry:
-            self.mapper.add_odometry(sample)
+            self.mapper.add_odometry(replace(sample, stamp_s=sample.stamp_s + self._shift_s) if self._shift_s else sample)
         if scan is None or self.is_paused:
             return
         started = time.thread_time()
-        self.mapper.add_scan(scan)
+        self.mapper.add_scan(replace(scan, stamp_s=scan.stamp_s + self._shift_s) if self._shift_s else scan)
         self.scan_cpu_s += time.thread_time() - started
         self.scans += 1
         now = time.monotonic()

@@ -48,17 +48,22 @@ def check_against_the_world(fleet: Fleet, stage: Stage, *robots: str) -> None:
         assert was.distance_m(believed) < 0.15
 
 
-def test_a_robot_killed_and_started_again_merges_again(fleet: Fleet) -> None:
+def test_a_robot_killed_and_started_again_finds_itself_in_its_own_map_and_merges_again(fleet: Fleet) -> None:
     stage = fleet.stage("office", robots=2)
     for actor in stage.robots:
         fleet.start(actor)
     stage.begin()
     fleet.until(lambda: fleet.agree("robot-1", "robot-2"), MERGE_WITHIN_S, "one map of both")
-    boot = fleet.status("robot-2")["boot"]
+    before = fleet.status("robot-2")
+    fleet.agents["robot-2"].ask("save")
     fleet.agents["robot-2"].kill()
     fleet.start(stage.robots[1])
-    assert fleet.status("robot-2")["boot"] != boot
+    fleet.until(lambda: fleet.status("robot-2")["mapping"].get("status") == "tracking", 20.0, "finding itself")
+    after = fleet.status("robot-2")
+    assert after["boot"] != before["boot"]
+    assert after["mapping"]["known_m2"] > 0.95 * before["mapping"]["known_m2"]
     fleet.until(lambda: fleet.agree("robot-1", "robot-2"), MERGE_WITHIN_S, "one map again")
+    check_against_the_world(fleet, stage, "robot-1", "robot-2")
 
 
 def test_robots_in_two_buildings_never_merge(fleet: Fleet) -> None:
