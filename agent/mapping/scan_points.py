@@ -21,6 +21,7 @@ ENOUGH_HITS = 80  # fewer than this within the matching range and the next ones 
 FAR = 2.4  # ... up to this many times as far: 60 m
 FACING_GAP_M = 0.4  # two neighbouring hits farther apart may be two things ...
 WIDEST_GAP_M = 1.0  # ... unless a third lies in line with them
+WIDEST_WALL_M = 3.0  # for its direction only: far down a corridor the dots of a wall are this far apart
 STRAIGHT = np.float32(0.985)  # cosine of 10 degrees
 STRAIGHT_CHORD = np.float32(0.8)  # cosine: chords that bend by more than 37 degrees meet in a corner
 MOST_SURFELS = 180  # beams 2 degrees apart say what can be said; four times as many cost four times the time
@@ -88,7 +89,7 @@ def between(ends_m: NDArray[np.float32], is_hit: NDArray[np.bool_], ranges_m: ND
     """
     step_m = ends_m[1:] - ends_m[:-1]
     gap_m = np.hypot(step_m[:, 0], step_m[:, 1])
-    is_surface = is_joined(step_m, gap_m, ranges_m) & is_hit[1:] & is_hit[:-1]
+    is_surface = is_joined(step_m, gap_m, ranges_m, WIDEST_GAP_M) & is_hit[1:] & is_hit[:-1]
     inner = np.where(is_surface, np.ceil(gap_m / VOXEL_M) - 1, 0).astype(np.int64)
     first = np.repeat(np.arange(len(gap_m)), inner)
     share = (np.arange(len(first)) - np.repeat(np.cumsum(inner) - inner, inner) + 1) / (inner[first] + 1)
@@ -96,11 +97,14 @@ def between(ends_m: NDArray[np.float32], is_hit: NDArray[np.bool_], ranges_m: ND
 
 
 def is_joined(
-    step_m: NDArray[np.float32], gap_m: NDArray[np.float32], ranges_m: NDArray[np.float64] | NDArray[np.float32]
+    step_m: NDArray[np.float32],
+    gap_m: NDArray[np.float32],
+    ranges_m: NDArray[np.float64] | NDArray[np.float32],
+    widest_m: float,
 ) -> NDArray[np.bool_]:
     """(N - 1,) whether neighbouring points lie on one surface."""
     is_facing = (gap_m < FACING_GAP_M) & (np.abs(np.diff(ranges_m)) < STEEPEST * gap_m)
-    return is_facing | goes_on_straight(step_m, gap_m)
+    return is_facing | (goes_on_straight(step_m, gap_m) & (gap_m < widest_m))
 
 
 def with_normals(hits_m: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -112,7 +116,9 @@ def with_normals(hits_m: NDArray[np.float32]) -> NDArray[np.float32]:
         return surfels
     step_m = hits_m[1:] - hits_m[:-1]
     joined = np.zeros(n + 3, bool)  # joined[i + 2]: point i and point i + 1
-    joined[2 : n + 1] = is_joined(step_m, np.hypot(step_m[:, 0], step_m[:, 1]), np.hypot(hits_m[:, 0], hits_m[:, 1]))
+    joined[2 : n + 1] = is_joined(
+        step_m, np.hypot(step_m[:, 0], step_m[:, 1]), np.hypot(hits_m[:, 0], hits_m[:, 1]), WIDEST_WALL_M
+    )
     i = np.arange(n)
     before = np.where(joined[i + 1], np.where(joined[i], 2, 1), 0)
     after = np.where(joined[i + 2], np.where(joined[i + 3], 2, 1), 0)
@@ -140,7 +146,7 @@ def goes_on_straight(step_m: NDArray[np.float32], gap_m: NDArray[np.float32]) ->
     is_straight = np.zeros(len(gap_m), bool)
     is_straight[1:] |= along & similar
     is_straight[:-1] |= along & similar
-    return is_straight & (gap_m < WIDEST_GAP_M)
+    return is_straight
 
 
 def beam_stamps_s(scan: LaserScan) -> NDArray[np.float64]:
