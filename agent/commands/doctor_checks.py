@@ -183,8 +183,8 @@ def port_thieves(machine: Machine) -> Iterator[Finding]:
 
 def view(machine: Machine) -> Iterator[Finding]:
     settings = machine.config.view
-    if not settings.enabled or settings.port == 0:
-        return
+    if not settings.enabled or settings.port == 0 or control_socket(machine.config.robot.id, machine.environ).exists():
+        return  # no page, any port, or our own robot has it
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

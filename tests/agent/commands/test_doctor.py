@@ -109,13 +109,16 @@ def test_a_state_directory_that_cannot_be_written(machine: Machine, monkeypatch:
     assert only(checks.state, asked).finding == f"{there} cannot be written: maps would be lost"
 
 
-def test_a_page_whose_port_is_taken(machine: Machine) -> None:
+def test_a_page_whose_port_is_taken(machine: Machine, robot: Callable[..., FakeRobot]) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        finding = only(checks.view, changed(machine, view=ViewConfig(port=taken.getsockname()[1])))
-    assert finding.level is Level.WARN
-    assert "in use" in finding.finding
+        asked = changed(machine, view=ViewConfig(port=taken.getsockname()[1]))
+        finding = only(checks.view, asked)
+        assert finding.level is Level.WARN
+        assert "in use" in finding.finding
+        robot("r1")  # it is our own robot that has it
+        assert list(checks.view(asked)) == []
 
 
 def test_a_lan_needs_multicast(machine: Machine) -> None:
