@@ -150,14 +150,14 @@ class Explorer:
         return list(leg)
 
     def _plan(self) -> None:
-        lengths, came = self._ways.lengths_from(self._at)
+        lengths = self._ways.lengths_from(self._at, FARTHEST_GOAL_M)
         goal = self._goal(lengths)
-        path = self._ways.path(came, goal, PLANNING_RADIUS_M - 0.05)
+        path = self._ways.path(lengths, goal, PLANNING_RADIUS_M - 0.05)
         self._leg = path[1:] or path
         self._at = self._leg[-1]
         self._visited += path
 
-    def _goal(self, lengths: NDArray[np.float64]) -> Cell:
+    def _goal(self, lengths: NDArray[np.float32]) -> Cell:
         """The reachable cell that is most new for its way: far from everything visited, a little random."""
         rows, cols = np.nonzero(np.isfinite(lengths) & (lengths < FARTHEST_GOAL_M) & (lengths > 0.5))
         if not len(rows):
