@@ -37,6 +37,9 @@ NEW_MAP_AFTER_S = 10.0  # of looking everywhere in vain
 STUCK_AFTER = 3  # identical scans in a row, while the wheels turn
 STUCK_MOVED_M = 0.05
 STUCK_TURNED_RAD = 0.05
+NO_WHEELS = (
+    "no odometry, and the scans are too far apart to follow without: connect the wheels, or drive slower; nothing is drawn"
+)
 
 
 class Mapper:
@@ -83,7 +86,7 @@ class Mapper:
         """The ordinary case: the robot is near where its wheels say."""
         motion = self._motion(points)
         tracked = self.map.track(motion, points)
-        if tracked.fraction < GOOD_FRACTION and self._contradiction(points, tracked) > CONTRADICTED:
+        if not self._is_believable(points, tracked):
             return self._contradicted(points, tracked)
         self.contradictions = 0
         self.map.note_motion(motion)
@@ -95,6 +98,12 @@ class Mapper:
         is_open = tracked.weakest < UNCONSTRAINED_RATIO
         status = MapperStatus.UNCONSTRAINED if is_open else MapperStatus.TRACKING
         return self._outcome(status, is_keyframe, tracked.fraction)
+
+    def _is_believable(self, points: ScanPoints, tracked: Tracked) -> bool:
+        """A good fit always; a poor one when wheels vouch for the pose and the map does not rule the scan out."""
+        if tracked.fraction >= GOOD_FRACTION:
+            return True
+        return bool(self.odometry.stamps_s) and self._contradiction(points, tracked) <= CONTRADICTED
 
     def _motion(self, points: ScanPoints) -> Motion:
         """Since the last accepted scan: by the wheels, or as before when there are no wheels."""
@@ -114,7 +123,8 @@ class Mapper:
         if self.contradictions >= LOST_AFTER:
             self.contradictions = 0
             self.lost_since_s = points.stamp_s
-        return self._held(points, MapperStatus.LOST, tracked.fraction, f"only {tracked.fraction:.0%} of the scan fits the map")
+        reason = f"only {tracked.fraction:.0%} of the scan fits the map" if self.odometry.stamps_s else NO_WHEELS
+        return self._held(points, MapperStatus.LOST, tracked.fraction, reason)
 
     def _look_everywhere(self, points: ScanPoints) -> ScanOutcome:
         """Lost: a few headings of the search per scan; found, or after a while a new map."""
@@ -131,7 +141,8 @@ class Mapper:
             self.search = None
             if points.stamp_s - self.lost_since_s > NEW_MAP_AFTER_S:
                 return self._begin_anew(points)
-        return self._held(points, MapperStatus.LOST, 0.0, "lost: looking for this place on the whole map; nothing is drawn")
+        reason = "lost: looking for this place on the whole map; nothing is drawn" if self.odometry.stamps_s else NO_WHEELS
+        return self._held(points, MapperStatus.LOST, 0.0, reason)
 
     def _begin_anew(self, points: ScanPoints) -> ScanOutcome:
         self.epoch += 1

@@ -108,6 +108,15 @@ def test_without_odometry_close_scans_still_make_a_map() -> None:
     assert outcome.T_map_robot.distance_m(path[0][1].inverse() @ path[-1][1]) < 0.08
 
 
+def test_without_odometry_scans_too_far_apart_are_not_drawn_and_the_reason_is_one_sentence() -> None:
+    mapper = Mapper(OPTIONS, seed=0)
+    rng = np.random.default_rng(2)
+    outcomes = [mapper.add_scan(scan_at(ROOMS, pose, s, rng)) for s, pose in rounds(80.0)[::17]]
+    held = [o for o in outcomes if o.status is MapperStatus.LOST]
+    assert held
+    assert all("no odometry" in o.reason and not o.is_keyframe for o in held)
+
+
 def test_a_stuck_lidar_draws_nothing_and_is_named(drive: Drive) -> None:
     drive.steps(60)
     revision = drive.mapper.estimate().revision
