@@ -43,7 +43,7 @@ class RobotConfig:
 class LidarConfig:
     """The laser and where it sits on the robot: the pose of its frame in the base frame (x forward, y left)."""
 
-    url: str = ""  # rplidar:/dev/ttyUSB0, ld06:..., sim:office?seed=3, log:FILE.clf; `mapquilt run` needs one
+    url: str = ""  # rplidar:/dev/ttyUSB0, sim:office?seed=3, log:FILE.clf; empty: the first that answers on a serial port
     mount_x_m: float = setting(0.0, low=-10.0, high=10.0)
     mount_y_m: float = setting(0.0, low=-10.0, high=10.0)
     mount_yaw_deg: float = setting(0.0, low=-360.0, high=360.0)
@@ -54,7 +54,7 @@ class LidarConfig:
 class WheelsConfig:
     """The base.  A geometry of 0 is the board's own: WT1 and Create 2 tell theirs, the others need it here."""
 
-    url: str = ""  # wheels:/dev/ttyACM0, create2:..., kobuki:..., sim:...; empty: with the LIDAR's simulator or log, else none
+    url: str = ""  # wheels:/dev/ttyACM0, create2:..., kobuki:..., sim:...; empty: the LIDAR's simulator or log, or who answers
     ticks_per_revolution: float = setting(0.0, low=0.0, high=1e7)
     wheel_radius_m: float = setting(0.0, low=0.0, high=2.0)
     track_m: float = setting(0.0, low=0.0, high=5.0)  # distance between the wheels

@@ -18,6 +18,7 @@ from typing import Any
 
 import cv2
 
+from agent.commands.plugged_in import with_what_is_plugged_in
 from agent.config import Config, control_socket, state_dir
 from agent.config_flags import add_config_arguments, load_from
 from agent.exits import BAD_INPUT, ENVIRONMENT, OK, PEER, USAGE, CommandError
@@ -76,9 +77,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def with_devices(config: Config) -> Config:
-    """A simulator or a recording is both devices at once."""
+    """A simulator or a recording is both devices at once; without a LIDAR in the settings, whatever is plugged in is taken."""
     if not config.lidar.url:
-        raise CommandError("no LIDAR: give --lidar rplidar:/dev/ttyUSB0 (mapquilt devices lists what is plugged in)", USAGE)
+        return with_what_is_plugged_in(config)
     if not config.wheels.url and config.lidar.url.startswith(("sim:", "log:")):
         return replace(config, wheels=replace(config.wheels, url=config.lidar.url))
     return config
