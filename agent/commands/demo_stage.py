@@ -12,9 +12,11 @@ from pathlib import Path
 from typing import Protocol
 
 from hw.carmen import read_recording
-from hw.sim.devices import ByteDevice, Ld06Lidar, RobotTicks, SickScanner, Wt1Board
+from hw.sim.catalogue import BASES, LIDARS
+from hw.sim.devices import ByteDevice, SickScanner
 from hw.sim.replay import Replay, ReplayBoard, ReplayScans
 from hw.sim.robot import SimulatedRobot
+from hw.sim.sight import Sight
 from hw.sim.sim_port import PtyServer
 from hw.sim.world import World, open_world
 from protocol.geometry import SE2
@@ -86,7 +88,7 @@ class SimulatedStage:
         self.robots = [self._actor(name, robot, 64 * seed + i) for i, (name, robot) in enumerate(self._by_name.items())]
 
     def _actor(self, name: str, robot: SimulatedRobot, seed: int) -> Actor:
-        lidar, wheels = self._lines.add(name, Ld06Lidar(robot, seed=seed), Wt1Board(RobotTicks(robot)))
+        lidar, wheels = self._lines.add(name, LIDARS["ld06"][0](Sight(robot, seed=seed)), BASES["wt1"].make(robot))
         return Actor(name, f"ld06:{lidar}", f"wheels:{wheels}")
 
     def __enter__(self) -> SimulatedStage:

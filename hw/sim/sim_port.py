@@ -23,9 +23,11 @@ from hw.driver import Driver
 from hw.errors import DeviceConfigError
 from hw.ld06 import Ld06
 from hw.sick_lms import SickLms
-from hw.sim.devices import ByteDevice, Ld06Lidar, RobotTicks, SickScanner, Wt1Board
+from hw.sim.catalogue import BASES, LIDARS
+from hw.sim.devices import ByteDevice, SickScanner
 from hw.sim.faults import FaultyDevice, garbled
 from hw.sim.robot import SimulatedRobot
+from hw.sim.sight import Sight
 from hw.sim.world import open_world
 from hw.supervisor import Device
 from hw.urls import DeviceUrl
@@ -181,8 +183,8 @@ def _open_simulated(url: DeviceUrl, kind: str) -> Device:
             _shared[url.text] = robot
         robot = _shared[url.text]
     if kind == "lidar":
-        return _device(url, Ld06(), Ld06Lidar(robot, seed=seed))
-    return _device(url, WheelDriver(WheelBoard(), "simulated wheels"), Wt1Board(RobotTicks(robot)))
+        return _device(url, Ld06(), LIDARS["ld06"][0](Sight(robot, seed=seed)))
+    return _device(url, WheelDriver(WheelBoard(), "simulated wheels"), BASES["wt1"].make(robot))
 
 
 def _device(url: DeviceUrl, driver: Driver, simulated: ByteDevice) -> Device:
