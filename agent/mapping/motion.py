@@ -18,6 +18,8 @@ from protocol.geometry import SE2, wrap_angle
 
 EXTRAPOLATION_S = 0.25  # a scan may be this much younger than the youngest odometry sample; boards report at 10 to 50 Hz
 KEPT_SAMPLES = 4096  # about 80 s at 50 Hz: longer than any gap between two scans that is still worth bridging
+LONGEST_GAP_S = 10.0  # without a sample: the board may have started anew meanwhile
+CLOCK_RESTART_S = 1.0  # a stamp this much older than the last is another clock; less is a late sample
 SLOWEST_SPEED_LIMIT_S = 0.1  # two samples closer in time than this are judged as if this far apart: stamps jitter
 
 
@@ -64,6 +66,8 @@ class OdometryTrack:
     def add(self, odometry: Odometry) -> bool:
         """Take one sample; False when it is older than the one before or not finite, and was refused."""
         sample = (odometry.x_m, odometry.y_m, odometry.theta_rad)
+        if self.stamps_s and odometry.stamp_s < self.stamps_s[-1] - CLOCK_RESTART_S:
+            self._begin_again()
         if not all(map(math.isfinite, (odometry.stamp_s, *sample))) or (self.stamps_s and odometry.stamp_s < self.stamps_s[-1]):
             self.refused += 1
             return False
@@ -71,7 +75,8 @@ class OdometryTrack:
         if self.poses:
             last = self.poses[-1]
             sample = (sample[0], sample[1], last[2] + wrap_angle(sample[2] - last[2]))
-            if odometry.is_discontinuity or self._is_jump(odometry.stamp_s - self.stamps_s[-1], last, sample):
+            is_gap = odometry.stamp_s - self.stamps_s[-1] > LONGEST_GAP_S
+            if odometry.is_discontinuity or is_gap or self._is_jump(odometry.stamp_s - self.stamps_s[-1], last, sample):
                 piece += 1
                 self.discontinuities += 1
         self.stamps_s.append(odometry.stamp_s)
@@ -80,6 +85,11 @@ class OdometryTrack:
         if len(self.stamps_s) > 2 * KEPT_SAMPLES:
             del self.stamps_s[:-KEPT_SAMPLES], self.poses[:-KEPT_SAMPLES], self.pieces[:-KEPT_SAMPLES]
         return True
+
+    def _begin_again(self) -> None:
+        """The clock started again (a reboot between checkpoint and resume): what was before is no help any more."""
+        self.stamps_s, self.poses, self.pieces = [], [], []
+        self.discontinuities += 1
 
     def _is_jump(self, seconds: float, a: tuple[float, float, float], b: tuple[float, float, float]) -> bool:
         """Faster than the robot can be, with half again for jitter: a reset or a jump, never motion."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -67,3 +68,17 @@ def test_a_map_of_another_resolution_is_refused_with_both_numbers() -> None:
     data = Mapper(OPTIONS, seed=7).checkpoint()
     with pytest.raises(CheckpointError, match=r"0\.05 m.*0\.1 m"):
         Mapper.restore(data, MappingOptions(particles=8, resolution_m=0.1))
+
+
+def test_after_a_reboot_the_robot_finds_itself_on_its_old_map() -> None:
+    """Another clock, wheels at zero, and carried three metres while it was off."""
+    pairs = readings(70.0)
+    mapper = Mapper(OPTIONS, seed=7)
+    feed(mapper, pairs[:250])
+    mapper = Mapper.restore(mapper.checkpoint(), OPTIONS)
+    true = [pose for _, pose in rounds(70.0)]
+    rest = [(replace(o, stamp_s=o.stamp_s - 49.0), replace(s, stamp_s=s.stamp_s - 49.0)) for o, s in pairs[280:]]
+    feed(mapper, rest)
+    assert mapper.epoch == 0
+    end = true[0].inverse() @ true[-1]
+    assert mapper.map.pose[:2] == pytest.approx((end.x_m, end.y_m), abs=0.08)

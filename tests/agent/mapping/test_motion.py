@@ -79,3 +79,15 @@ def test_more_motion_is_less_certain() -> None:
     short, long = noise.deviations(SE2(0.1, 0.0, 0.05)), noise.deviations(SE2(1.0, 0.0, 0.5))
     assert long[0] > short[0] > 0
     assert long[1] > short[1] > 0
+
+
+def test_a_clock_that_starts_again_begins_a_new_track() -> None:
+    track = track_of((500.0, 3.0, 0.0, 0.0), (500.1, 3.1, 0.0, 0.0), (2.0, 0.0, 0.0, 0.0), (2.1, 0.1, 0.0, 0.0))
+    assert track.refused == 0
+    assert not track.motion_between(500.1, 2.1).is_known
+    assert track.motion_between(2.0, 2.1).T_from_to.x_m == pytest.approx(0.1)
+
+
+def test_after_a_long_gap_motion_is_unknown() -> None:
+    track = track_of((0.0, 0.0, 0.0, 0.0), (20.0, 1.0, 0.0, 0.0))
+    assert not track.motion_between(0.0, 20.0).is_known
