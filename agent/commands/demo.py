@@ -40,6 +40,7 @@ EXAMPLES = """\
 
 DURATION_S = 40.0  # exploring goes on this long although the maps may fit sooner: a person sees the map grow
 LOOK_EVERY_S = 0.5
+FIRST_SCANS_WITHIN_S = 5.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -115,8 +116,17 @@ class Fleet:
                 self.page = ready["page"] or ""
         for agent in self.agents[1:]:
             agent.wait_ready()
+        self.await_first_scans()
         self.stage.begin()
         self.started_s = time.monotonic()
+
+    def await_first_scans(self) -> None:
+        """A map begins where its robot stands at the first scan; a robot whose LIDAR does not come up is left behind."""
+        deadline_s = time.monotonic() + FIRST_SCANS_WITHIN_S
+        while time.monotonic() < deadline_s and self.stage.truth() is not None:
+            if all(status["mapping"]["scans"] for status in self.statuses()):
+                return
+            time.sleep(0.1)
 
     def statuses(self) -> list[dict[str, Any]]:
         """What every robot says of itself; a robot that went away ends the demo."""

@@ -60,7 +60,7 @@ class Nemesis:
             cables = {actor.name: network.cable(router) for actor in stage.robots}
             for actor in stage.robots:
                 self.start(fleet, stage, cables, actor.name)
-            stage.begin()
+            fleet.begin(stage)
             names = list(cables)
             fleet.until(lambda: fleet.agree(*names), 180.0, "one map before the first fault")
             for number in range(args.episodes):

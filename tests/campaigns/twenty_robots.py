@@ -43,7 +43,7 @@ def campaign(args: argparse.Namespace) -> dict[str, Any]:
         for actor in stage.robots:
             fleet.start(actor, arguments=["--set", f"mapping.particles={args.particles}", "--no-state"])
             print(f"up: {actor.name}", file=sys.stderr)
-        stage.begin()
+        fleet.begin(stage)
         started = time.monotonic()
         names, merged_s, most = [actor.name for actor in stage.robots], None, 0
         rss_mb = 0.0
@@ -61,6 +61,10 @@ def campaign(args: argparse.Namespace) -> dict[str, Any]:
                 break
             time.sleep(1.0)
         statuses = [fleet.status(name) for name in names]
+        for error in sorted(
+            {f"{w['name']}: {w['error']}" for status in statuses for w in status.get("workers", []) if w["error"]}
+        ):
+            print(error, file=sys.stderr)
     mappings = [status["mapping"] for status in statuses if status]
     return {
         "robots": args.robots,

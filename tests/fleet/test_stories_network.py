@@ -27,7 +27,7 @@ def test_a_partition_heals_and_what_was_mapped_meanwhile_arrives(fleet: Fleet) -
     cables = {actor.name: network.cable(router) for actor in stage.robots}
     for actor in stage.robots:
         fleet.start(actor, connect=[cables[actor.name].locator], arguments=["--profile", "infrastructure"])
-    stage.begin()
+    fleet.begin(stage)
     fleet.until(lambda: fleet.agree("robot-1", "robot-2"), MERGE_WITHIN_S, "one map through the router")
     known_m2 = fleet.status("robot-2")["mapping"]["known_m2"]
     before = fleet.global_digest("robot-1")
@@ -60,7 +60,7 @@ def test_a_hostile_peer_changes_nobodys_map(fleet: Fleet) -> None:
     settings = NetworkSettings("evil", fleet=fleet.name, connect=tuple(first.ready["locators"]))
     lies = [b"", bytes(20_000), b"MQ\x01\x02" + b"\xff" * 500, b"MQ\x01\x03\x00\x00\x00\x00\xdf\xff\xff\xff\xff"]
     with Exchange(settings, lambda _: bytes(30_000)) as evil:
-        stage.begin()
+        fleet.begin(stage)
 
         def lie() -> bool:
             for victim in ("evil", "robot-1", "robot-2"):

@@ -65,6 +65,12 @@ class Fleet:
         agent.wait_ready()
         return agent
 
+    def begin(self, stage: Stage) -> None:
+        """The robots drive off once each has seen its surroundings: where it saw them first is where its map begins."""
+        names = [actor.name for actor in stage.robots if actor.name in self.agents]
+        self.until(lambda: all(self.status(name).get("mapping", {}).get("scans") for name in names), 30.0, "first scans")
+        stage.begin()
+
     def router(self, name: str = "router", connect: Sequence[str] = ()) -> str:
         """A router's process; its locator."""
         connections = [part for locator in connect for part in ("--connect", locator)]
