@@ -218,7 +218,7 @@ class Rplidar(SpinningLidar):
         self.counters.gap_bytes = 0
         if descriptor.is_multi:
             self.scan_type = descriptor.type
-            self._assembler.witnesses = (1, 3) if descriptor.type == wire.ULTRA_TYPE else (1,)
+            self._assembler.witnesses = (1, 3) if descriptor.type in KINDS else (1,)  # an XOR lets pairs of equal flips through
             self._restart_stream()
             self._drop_held()
             self._assembler.restart()

@@ -1,0 +1,142 @@
+"""YDLIDAR, Hokuyo, SICK and XV-11: what is written is read, and what the devices say besides ranges is understood."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hw import hokuyo, ld06, sick_lms, xv11, ydlidar
+from hw.hokuyo import Hokuyo
+from hw.sick_lms import SickLms
+from hw.ydlidar import YdLidar
+from tests.harness.lidar_streams import STREAMS, decode
+
+words = st.integers(0, 65535)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.data(), st.integers(1, 80), st.sampled_from([2, 3, 4]))
+def test_ydlidar_packets_of_every_width(data: st.DataObject, n: int, width: int) -> None:
+    samples = tuple(data.draw(st.lists(words, min_size=n, max_size=n)))
+    most = {2: 0, 3: 255, 4: 65535}[width]
+    intensities = tuple(data.draw(st.lists(st.integers(0, most), min_size=n, max_size=n))) if width > 2 else ()
+    packet = ydlidar.Packet(n == 1, 7.5 if n == 1 else 0.0, 100, 2000, samples, intensities)
+    assert ydlidar.decode(ydlidar.encode(packet, width)) == packet
+
+
+def test_ydlidar_clock_packets_between_scan_packets_are_no_damage() -> None:
+    stream = STREAMS["ydlidar-2B"](seconds=1.0)
+    packets, at = [], 0
+    while at < len(stream.data):
+        end = at + 10 + 2 * stream.data[at + 3]
+        packets.append(stream.data[at:end] + ydlidar.encode_clock(at))
+        at = end
+    driver = YdLidar("g4")
+    scans = decode(stream, b"".join(packets), chunk=200, driver=driver)
+    assert len(scans) >= 6
+    assert (driver.counters.bad_frames, driver.counters.skipped_bytes) == (0, 0)
+
+
+def test_a_ydlidar_packet_that_ran_backwards_is_refused() -> None:
+    """Seen in a real X4 capture: a good checksum, and LSA 1.2 degrees before FSA."""
+    stream = STREAMS["ydlidar-2B"](seconds=1.0)
+    backwards = ydlidar.encode(ydlidar.Packet(False, 0.0, round(223.34 * 64), round(222.17 * 64), (4000,) * 40))
+    at = 12 + 6 * 90  # behind the start packet and six others
+    driver = YdLidar("g4")
+    scans = decode(stream, stream.data[: 4 * 1142 + at] + backwards + stream.data[4 * 1142 + at :], chunk=300, driver=driver)
+    assert driver.counters.rejected >= 1
+    assert all(len(scan.ranges_m) <= 501 for scan in scans)
+
+
+def test_tof_ydlidars_count_whole_millimetres_and_are_not_corrected() -> None:
+    driver = YdLidar("tg30")
+    frames = np.zeros((1, 330), np.uint8)
+    frames[0, 10:14] = [0x10, 0x27, 0x00, 0x00]
+    driver._width = 2
+    assert driver._samples(frames)[0][0, :2].tolist() == [10000.0, 0.0]
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 2**24 - 1), st.integers(2, 4))
+def test_scip_values(value: int, characters: int) -> None:
+    value %= 64**characters
+    text = hokuyo.encode_value(value, characters)
+    assert all(0x30 <= byte <= 0x6F for byte in text)
+    assert hokuyo.decode_value(text) == value
+
+
+@pytest.mark.parametrize("echo", [b"MD0000010000100", b"MS0000010000100", b"ME0000010000100", b"GD0000010000"])
+def test_hokuyo_scan_messages(echo: bytes) -> None:
+    mm = [(37 * k) % 4096 for k in range(101)]
+    intensities = [k * 11 for k in range(101)] if echo[1:2] == b"E" else None
+    message = hokuyo.decode_message(hokuyo.encode_scan(echo, 123456, mm, intensities)[:-2])
+    assert message is not None
+    scan = hokuyo.scan_of(message)
+    assert scan is not None
+    assert (scan.clock_ms, scan.values.tolist()) == (123456, mm)
+    assert (scan.intensities.tolist() if scan.intensities is not None else None) == intensities
+
+
+def test_hokuyo_error_codes_are_no_ranges_and_nothing_in_range_is_free_only_when_asked() -> None:
+    parameters = hokuyo.encode_message(b"PP", b"00", hokuyo.UTM_30LX.lines())
+    data = parameters + hokuyo.encode_scan(b"MD0000108001000", 0, [1, 2, 5, 22, 23, 60000] + [1000] * 1075)
+    for is_free, first in ((False, np.nan), (True, np.inf)):
+        scan = Hokuyo(sees_nothing_as_free=is_free).feed(data, 1.0)[0]
+        assert np.array_equal(scan.ranges_m[:4], np.array([first, np.nan, np.nan, np.nan], np.float32), equal_nan=True)
+        assert scan.ranges_m[4:7].tolist() == pytest.approx([0.023, 60.0, 1.0])
+
+
+def test_a_lost_message_end_costs_the_hokuyo_one_scan() -> None:
+    stream = STREAMS["hokuyo-urg"](seconds=1.0)
+    size = len(stream.data) // 10
+    for at in (size - 1, 3 * size - 2, 5 * size - 1):
+        scans = decode(stream, stream.prefix + stream.data[:at] + stream.data[at + 1 :], chunk=512)
+        assert len(scans) >= 9
+
+
+def test_hokuyo_sums_with_and_without_the_semicolon_are_both_read() -> None:
+    assert hokuyo.is_line_good(b"DMIN:20;4")
+    with_semicolon = b"DMIN:20;"
+    assert hokuyo.is_line_good(with_semicolon + bytes((hokuyo.line_sum(with_semicolon),)))
+    assert not hokuyo.is_line_good(b"DMIN:21;4")
+
+
+@pytest.mark.parametrize("n", sick_lms.FIELDS)
+def test_sick_scans_of_every_field(n: int) -> None:
+    telegram = sick_lms.scan_telegram([500 + k % 300 for k in range(n)])
+    scan = SickLms().feed(telegram, 10.0)[0]
+    field_deg, step_deg = sick_lms.FIELDS[n]
+    assert len(scan.ranges_m) == n
+    assert np.degrees(scan.angles_rad[[0, -1]]).tolist() == pytest.approx([-field_deg / 2, field_deg / 2])
+    assert np.degrees(scan.angles_rad[1] - scan.angles_rad[0]) == pytest.approx(step_deg, abs=1e-4)
+    assert scan.ranges_m[0] == pytest.approx(5.0)
+
+
+def test_sick_flags_and_codes_are_no_ranges() -> None:
+    values = [0x2000 | 800, 0x1FF7, 0, 0x1FFF] + [800] * 177
+    metres = sick_lms.ranges_m(sick_lms.ScanPayload(tuple(values)))
+    assert np.array_equal(metres[:5], [8.0, np.nan, np.nan, np.nan, 8.0], equal_nan=True)
+    assert np.isnan(sick_lms.ranges_m(sick_lms.ScanPayload((0x7FF7,) + (8000,) * 180, is_mm=True))[0])
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 89), st.lists(st.integers(0, 0x3FFF), min_size=4, max_size=4), st.lists(words, min_size=4, max_size=4))
+def test_xv11_packets(index: int, mm: list[int], signals: list[int]) -> None:
+    packet = xv11.Packet(index, 300.0, tuple(mm), tuple(signals), (True, False, False, True), (False, True, False, False))
+    assert xv11.decode_xv11(xv11.encode_xv11(packet)) == packet
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 59), st.lists(words, min_size=6, max_size=6), st.lists(words, min_size=6, max_size=6))
+def test_lds01_packets(index: int, mm: list[int], signals: list[int]) -> None:
+    packet = xv11.Packet(index, 298.7, tuple(mm), tuple(signals))
+    assert xv11.decode_lds01(xv11.encode_lds01(packet)) == packet
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 65535), st.integers(0, 35999), st.integers(0, 29999), st.lists(words, min_size=12, max_size=12))
+def test_ldrobot_packets(speed: int, start: int, clock_ms: int, mm: list[int]) -> None:
+    packet = ld06.Packet(speed, start, (start + 880) % 36000, clock_ms, tuple(mm), tuple(range(12)))
+    assert ld06.decode(ld06.encode(packet)) == packet
