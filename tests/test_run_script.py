@@ -59,7 +59,7 @@ def program(path: Path, text: str) -> None:
 def start(checkout: Path, machine: Path, *words: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     environ = {"PATH": str(machine), "HOME": str(machine.parent), "PYTHONPATH": "/opt/ros/elsewhere"}
     return subprocess.run(
-        [checkout / "run", *words], env=environ, cwd=cwd or machine, capture_output=True, text=True, timeout=100, check=False
+        [checkout / "run", *words], env=environ, cwd=cwd or machine, capture_output=True, text=True, timeout=300, check=False
     )
 
 
@@ -101,6 +101,7 @@ def test_a_checkout_that_cannot_be_written_says_so(checkout: Path, machine: Path
     assert "take a copy of your own with: git clone" in refusal(checkout, machine)
 
 
+@pytest.mark.timeout(400)  # makes an environment: seconds, minutes on a machine under heavy load
 def test_the_first_start_installs_the_second_only_starts(checkout: Path, machine: Path) -> None:
     (machine / "python3").symlink_to(sys.executable)
     venv = checkout / ".venv"
@@ -131,6 +132,7 @@ def test_the_first_start_installs_the_second_only_starts(checkout: Path, machine
     assert str(checkout) in (venv / "bin" / "mapquilt").read_text()
 
 
+@pytest.mark.timeout(400)
 def test_a_start_that_was_killed_or_failed_is_made_good_by_the_next(checkout: Path, machine: Path) -> None:
     (machine / "python3").symlink_to(sys.executable)
     environ = {"PATH": str(machine), "HOME": str(machine.parent)}
