@@ -15,7 +15,6 @@ import contextlib
 import json
 import math
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -62,18 +61,19 @@ lidar.stop()
 print(json.dumps(beams))
 """,
     "lds2d": """
-import json, sys, types
-from lds2d import Lidar
+import itertools, json, sys, types
+from lds2d import Lidar, NotSupportedError
 still = types.SimpleNamespace(set_duty=lambda duty: None, close=lambda: None)  # the XV-11's host drives its motor
 lidar = Lidar.open(sys.argv[2], sys.argv[1], **({"motor": still} if sys.argv[2] == "XV11" else {}))
-beams = []
-for k, scan in enumerate(lidar.scans()):
-    beams += [[p.angle_deg, p.dist_mm] for p in scan.points] if k else []
-    if k == 4:
-        break
+try:
+    lidar.start()
+except NotSupportedError:
+    pass
+beams = [[p.angle_deg, p.dist_mm] for p in itertools.islice(lidar.points(), 3000)]
 print(json.dumps(beams))
 """,
 }
+# lds2d reads an LDS-01 one degree off the maker's own ROS driver, which we follow, so that pair is not here.
 CASES = [  # (client, device, what the client is told)
     ("rplidar-roboticia", "rplidar-a1", "normal"),
     ("pyrplidar", "rplidar-a1", "standard"),
@@ -87,7 +87,6 @@ CASES = [  # (client, device, what the client is told)
     ("lds2d", "ydlidar-x2", "YDLIDAR-X2"),
     ("lds2d", "ydlidar-x4", "YDLIDAR-X4"),
     ("lds2d", "xv11", "XV11"),
-    ("lds2d", "lds01", "LDS01"),
     ("rawlog-grabber", "hokuyo-urg", "CHokuyoURG"),
     ("rawlog-grabber", "hokuyo-utm", "CHokuyoURG"),
     ("rawlog-grabber", "sick-lms291", "CSickLaserSerial"),
@@ -197,29 +196,28 @@ def by_mrpt(folder: Path, device: str, driver: str) -> Beams:
     """Grab for a few seconds, then write the scans of the log as text."""
     (folder / "grab.ini").write_text(MRPT_INI.format(folder=folder, driver=driver, port=folder / "port"))
     with (folder / "out").open("w") as out:
-        grabber = subprocess.Popen(["rawlog-grabber", str(folder / "grab.ini")], stdin=subprocess.DEVNULL, stdout=out, stderr=out)
+        command = ["rawlog-grabber", str(folder / "grab.ini")]
+        grabber = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=out, stderr=out)
         time.sleep(SECONDS / 2)
-        grabber.send_signal(signal.SIGINT)
         try:
-            grabber.wait(5)
+            grabber.communicate(b"x", 8)  # it ends at the press of any key
         except subprocess.TimeoutExpired:
             grabber.kill()
     logs = sorted(folder.glob("log*.rawlog"))
     if not logs:
         print((folder / "out").read_text()[-400:])
         return []
-    command = ["rawlog-edit", "-i", str(logs[0]), "--export-2d-scans-txt", "--txt-externals"]
-    subprocess.run(command[:-1], cwd=folder, capture_output=True, timeout=30, check=False)
-    rows = [
-        line.split() for path in folder.glob("log*LASER.txt") for line in path.read_text().splitlines() if line[:1] not in "%#"
-    ]
-    scans = [[float(word) for word in row] for row in rows if len(row) > 100]
-    first_deg, last_deg = FIELDS_DEG[device]
-    return [
-        (float(deg), metres)
-        for scan in scans[-5:]
-        for deg, metres in zip(np.linspace(first_deg, last_deg, len(scan)), scan, strict=True)
-    ]
+    command = ["rawlog-edit", "-i", logs[0].name, "--export-2d-scans-txt"]  # a path with a folder is cut wrongly there
+    subprocess.run(command, cwd=folder, capture_output=True, timeout=30, check=False)
+    rows = [line.split() for path in folder.glob("log*LASER.txt") for line in path.read_text().splitlines() if line[:1] != "%"]
+    return [beam for row in rows[-5:] for beam in scan_of(device, [float(word) for word in row[1:]])]
+
+
+def scan_of(device: str, values: list[float]) -> Beams:
+    """A line of an exported log: as many ranges as marks of which of them are valid."""
+    n = len(values) // 2
+    beams = zip(np.linspace(*FIELDS_DEG[device], n).tolist(), values[:n], values[n:], strict=True)
+    return [(degrees, metres) for degrees, metres, is_valid in beams if is_valid]
 
 
 def errors_m(beams: Beams) -> np.ndarray:
