@@ -127,7 +127,9 @@ class Mapper:
         return self._held(points, MapperStatus.LOST, tracked.fraction, reason)
 
     def _look_everywhere(self, points: ScanPoints) -> ScanOutcome:
-        """Lost: a few headings of the search per scan; found, or after a while a new map."""
+        """Lost: back where the wheels say, or a few headings of the search per scan; found, or after a while a new map."""
+        if self.map.track(self._motion(points), points).fraction >= GOOD_FRACTION:
+            return self._found(points)
         if self.search is None:
             self.search = self.map.search_for(points.surfels, points.stamp_s)
         self.search.step()
@@ -135,14 +137,18 @@ class Mapper:
             found = self.search.answer(self.map.filter.fields, self.map.filter.followed)
             if found is not None:
                 self.map.move_to(found, self.search.stamp_s)
-                self.search, self.lost_since_s = None, math.nan
-                self.confirmations_missing = CONFIRMED_AFTER
-                return self._follow(points)
+                return self._found(points)
             self.search = None
             if points.stamp_s - self.lost_since_s > NEW_MAP_AFTER_S:
                 return self._begin_anew(points)
         reason = "lost: looking for this place on the whole map; nothing is drawn" if self.odometry.stamps_s else NO_WHEELS
         return self._held(points, MapperStatus.LOST, 0.0, reason)
+
+    def _found(self, points: ScanPoints) -> ScanOutcome:
+        """Go on from where the map now says the robot was, drawing nothing until a few scans agree."""
+        self.search, self.lost_since_s = None, math.nan
+        self.confirmations_missing = CONFIRMED_AFTER
+        return self._follow(points)
 
     def _begin_anew(self, points: ScanPoints) -> ScanOutcome:
         self.epoch += 1

@@ -179,6 +179,24 @@ def test_a_kidnapped_robot_finds_itself_again_on_its_own_map(drive: Drive) -> No
     assert drive.mapper.epoch == 0
 
 
+def test_a_crowd_around_the_robot_ends_in_the_same_map_at_the_same_place(drive: Drive) -> None:
+    drive.steps(150)
+    crowd = np.array([[-1, -0.5, 0.9, -0.5], [0.9, -0.5, 0.9, 0.6], [0.9, 0.6, -0.9, 0.6], [-0.9, 0.6, -1, -0.5]])
+    x, y = drive.path[drive.at][1].x_m, drive.path[drive.at][1].y_m
+    outcomes = []
+    for k in range(20):  # the robot waits
+        stamp_s = drive.path[drive.at][0] + 0.2 * k
+        around = crowd + np.array([x, y, x, y]) + drive.rng.normal(0.0, 0.1, crowd.shape)
+        drive.mapper.add_odometry(replace(drive.wheels.sample(stamp_s, drive.path[drive.at][1]), stamp_s=stamp_s))
+        outcomes.append(drive.mapper.add_scan(scan_at(around, drive.path[drive.at][1], stamp_s, drive.rng)))
+    assert outcomes[10].status is MapperStatus.LOST
+    drive.path = [(s + (4.0 if k >= drive.at else 0.0), pose) for k, (s, pose) in enumerate(drive.path)]
+    drive.steps(25)
+    assert drive.mapper.epoch == 0
+    assert drive.after.status in (MapperStatus.TRACKING, MapperStatus.UNCONSTRAINED)
+    assert drive.error_m() < 0.06
+
+
 def test_a_robot_carried_to_an_unknown_place_begins_a_new_map(drive: Drive) -> None:
     drive.steps(200)
     before = drive.mapper.estimate()
