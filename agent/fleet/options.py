@@ -30,6 +30,8 @@ class FleetOptions:
     renew_growth: float = 0.30  # a live edge is proposed anew, with better figures, when the overlap has grown by this
     coarse_hopeful_score: float = 4.0  # metres of agreeing wall at 20 cm below which the fine map is not pulled at once
     coarse_skip_bytes: int = 8_192  # a fine map this small is pulled at once: the coarse one costs as much
+    strangers_at_once: int = 32  # robots whose maps are pulled without waiting, and then this many a minute:
+    strangers_per_minute: float = 30.0  # what a fleet of any size may cost in pulled maps
     max_edges: int = 6  # per robot: enough loops to find a wrong edge, few enough to keep verified
     max_held_maps: int = 24  # larger groups take the global map from its composer instead of every member's map
     max_peers: int = 1_024

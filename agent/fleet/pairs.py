@@ -21,6 +21,7 @@ from agent.fleet.ledger import Ledger, pair_key, supported
 from agent.fleet.members import Peer
 from agent.fleet.state import Presence
 from agent.merging.result import MatchStatus, MergeResult, inverse_covariance
+from protocol.features import LINE_COLUMNS, FeatureMap
 from protocol.geometry import SE2, wrap_angle
 from protocol.messages import NO_DIGEST, Evidence, MapVersion, Stance, Statement, Symmetric3
 
@@ -36,6 +37,7 @@ class Purpose(enum.Enum):
     RECHECK = "recheck"  # an edge lives; does it still?
 
 
+_LENGTH_COLUMN = LINE_COLUMNS.index("length_m")
 _LONGEST_DOUBT_S = 60.0  # between two checks of proposals of a peer whose last ones were refused
 
 _URGENCY = {
@@ -82,6 +84,9 @@ class Pair:
     refused: Evidence | None = None  # evidence of theirs that we checked and did not find true
     refusals: int = 0  # in a row
     refused_s: float = 0.0
+    promise: float = 0.0  # how alike the features are: whom to look at first
+    promise_of: tuple[int, int] = (-1, -1)  # frames and revisions it was computed from
+    is_courted: bool = False  # its maps may be pulled
     wants_coarse: bool = False
     wants_fine: bool = False
 
@@ -104,6 +109,7 @@ class PairWork:
         self._ledger = ledger
         self.pairs: dict[str, Pair] = {}
         self._running: _Running | None = None
+        self._tokens, self._tokens_s = float(ledger.options.strangers_at_once), 0.0
 
     def pair(self, peer: str) -> Pair:
         return self.pairs.setdefault(peer, Pair(peer))
@@ -112,7 +118,9 @@ class PairWork:
 
     def next_job(self, peers: list[Peer], now_s: float) -> None:
         """Update what each pair waits for; start the most urgent comparison when none runs."""
-        options = [option for peer in peers if (option := self._option(peer, now_s)) is not None]
+        self._refill(now_s)
+        ordered = sorted(peers, key=lambda peer: -self._promise(peer))
+        options = [option for peer in ordered if (option := self._option(peer, now_s)) is not None]
         timeout_s = 3.0 * self._ledger.options.fetch_timeout_s
         if self._running is not None and now_s - self._running.since_s < timeout_s:
             return
@@ -183,7 +191,7 @@ class PairWork:
                     return None
             return (Purpose.HINT, None, pair.hint) if pair.hint else (Purpose.SEARCH, None, None)
         announced = peer.announcement
-        if announced is None:
+        if announced is None or not self._may_court(pair):
             return None
         if announced.fine_bytes <= options.coarse_skip_bytes or pair.phase == "hopeful" or pair.coarse_misses >= 3:
             pair.wants_fine = True
@@ -199,6 +207,28 @@ class PairWork:
             pair.wants_coarse = True
             return None
         return Purpose.COARSE, None, None
+
+    def _may_court(self, pair: Pair) -> bool:
+        """Strangers are looked at a few a minute: in a fleet of a thousand nobody can look at everybody at once."""
+        if not pair.is_courted and self._tokens >= 1.0:
+            self._tokens -= 1.0
+            pair.is_courted = True
+        return pair.is_courted
+
+    def _refill(self, now_s: float) -> None:
+        options = self._ledger.options
+        gained = (now_s - self._tokens_s) / 60.0 * options.strangers_per_minute
+        self._tokens, self._tokens_s = min(self._tokens + gained, float(options.strangers_at_once)), now_s
+
+    def _promise(self, peer: Peer) -> float:
+        """How much wall of our features has a like in theirs; strangers that promise most come first."""
+        ours, theirs = self._ledger.own.announcement, peer.announcement
+        if ours is None or theirs is None:
+            return 0.0
+        pair, of = self.pair(peer.robot), (ours.map.revision, theirs.map.revision)
+        if pair.promise_of != of:
+            pair.promise, pair.promise_of = common_length_m(ours.features, theirs.features), of
+        return pair.promise
 
     def _must_verify(self, pair: Pair, said: Statement, mine: Statement | None, now_s: float) -> bool:
         """Whether they propose something we have not judged, and that outranks what we propose ourselves."""
@@ -234,7 +264,7 @@ class PairWork:
         if pair.is_urgent or pair.checked is None:
             return True
         has_grown = self._area_m2(peer) >= pair.checked.area_m2 * (1.0 + options.reverify_growth)
-        return waited_s >= (options.reverify_period_s if has_grown else options.renew_period_s)
+        return waited_s >= (options.reverify_period_s if has_grown else self._renew_period_s())
 
     def _is_due(self, attempt: Attempt | None, area_m2: float, theirs: MapVersion | None, now_s: float) -> bool:
         """Whether there is more map than last time; or any other map at all, after a long while."""
@@ -367,16 +397,18 @@ class PairWork:
             share = agreement(running.job.ours, running.job.theirs, T).wall_conflict_share
             pair.conflict_share = share if pair.conflict_share < 0.0 else min(share, pair.conflict_share)
 
+    def _renew_period_s(self) -> float:
+        """Everybody hears every renewal, so large fleets renew less often."""
+        options = self._ledger.options
+        return options.renew_period_s * max(1.0, len(self._ledger.peers) / options.max_beats_per_s)
+
     def _is_news(self, pair: Pair, live: Evidence, running: _Running, result: MergeResult, now_s: float) -> bool:
         """Whether the edge is worth proposing anew with better figures."""
         T, T_old = result.T_ours_theirs, running.job.T_ours_theirs
         assert T is not None and T_old is not None
         has_moved = T.distance_m(T_old) > 0.04 or abs(wrap_angle(T.theta_rad - T_old.theta_rad)) > 0.005
         cited = {live.map_a.digest, live.map_b.digest}
-        is_old = (
-            cited != {running.ours.digest, running.theirs.digest}
-            and now_s - pair.renewed_s >= self._ledger.options.renew_period_s
-        )
+        is_old = cited != {running.ours.digest, running.theirs.digest} and now_s - pair.renewed_s >= self._renew_period_s()
         return has_moved or is_old or result.overlap_m2 > live.overlap_m2 * (1.0 + self._ledger.options.renew_growth)
 
     def _is_same(self, T: SE2 | None, other: SE2) -> bool:
@@ -496,6 +528,15 @@ class PairWork:
             theirs=running.theirs.digest.hex()[:8],
             T_ours_theirs=None if T is None else (T.x_m, T.y_m, T.theta_rad),
         )
+
+
+def common_length_m(ours: FeatureMap, theirs: FeatureMap) -> float:
+    """Length of our longest lines for which they have one of nearly the same length: rough, and enough to sort by."""
+    mine, yours = (np.sort(features.lines[:, _LENGTH_COLUMN])[::-1][:40] for features in (ours, theirs))
+    if not len(mine) or not len(yours):
+        return 0.0
+    nearest = np.abs(mine[:, None] / yours[None, :] - 1.0).min(axis=1)
+    return float(mine[nearest < 0.05].sum())
 
 
 def _is_in_frame(peer: Peer) -> bool:

@@ -142,9 +142,8 @@ def main() -> int:
     if args.json:
         args.json.parent.mkdir(parents=True, exist_ok=True)
         args.json.write_text(json.dumps([asdict(verdict) for verdict in verdicts], indent=1) + "\n")
-    print(
-        "| attack | honest cells altered: worst, at the end | honest robots misplaced | apart | liar out after | quarantined after | un-merge exact |"
-    )
+    columns = "attack | altered: worst, at the end | misplaced | apart | liar out after | quarantined after | un-merge exact"
+    print(f"| {columns} |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for name in dict.fromkeys(verdict.attack for verdict in verdicts):
         own = [verdict for verdict in verdicts if verdict.attack == name]

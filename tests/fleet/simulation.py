@@ -37,13 +37,13 @@ MIN_OVERLAP_M2 = 40.0
 
 
 @functools.lru_cache(maxsize=64)
-def random_world(seed: int, side_m: float = 60.0, cell_m: float = 0.5) -> OccupancyGrid:
-    """Free space with walls: nothing repeats."""
+def random_world(seed: int, side_m: float = 60.0, cell_m: float = 0.5, walls: int | None = None) -> OccupancyGrid:
+    """Free space with walls of up to 15 m (a quarter of a small world): nothing repeats."""
     rng = np.random.default_rng(seed)
     n = int(side_m / cell_m)
     cells = np.full((n, n), FREE, np.int8)
-    for _ in range(n):
-        r, c, length = rng.integers(0, n), rng.integers(0, n), int(rng.integers(4, n // 4))
+    for _ in range(walls or n):
+        r, c, length = rng.integers(0, n), rng.integers(0, n), int(rng.integers(4, min(n // 4, int(15 / cell_m))))
         if rng.random() < 0.5:
             cells[r, c : c + length] = OCCUPIED
         else:
@@ -60,6 +60,7 @@ class Explorer:
     seen: NDArray[np.bool_]
     T_world_robot: SE2
     epoch: int = 1
+    features: FeatureMap = field(default_factory=FeatureMap)
     _grid: OccupancyGrid | None = None
 
     @staticmethod
@@ -128,6 +129,7 @@ class Node:
     notes: list[Note] = field(default_factory=list)
     sent: Counter[str] = field(default_factory=Counter)  # bytes by kind
     messages: Counter[str] = field(default_factory=Counter)
+    received_messages: int = 0
     received_bytes: int = 0
     pulled_bytes: int = 0
 
@@ -162,6 +164,7 @@ class Fleet:
         self.link = link or Link()
         self.judge = judge or truthful
         self.is_encoded = is_encoded
+        self.tick_s = TICK_S
         self.now_s = 0.0
         self.nodes: dict[str, Node] = {}
         self.partition: dict[str, int] = {}
@@ -191,7 +194,7 @@ class Fleet:
     def share_map(self, node: Node) -> None:
         assert node.explorer is not None
         if node.coordinator is not None:
-            self.carry_out(node, node.coordinator.on_local_map(node.explorer, FeatureMap(), self.local_s(node)))
+            self.carry_out(node, node.coordinator.on_local_map(node.explorer, node.explorer.features, self.local_s(node)))
 
     def local_s(self, node: Node) -> float:
         return self.now_s + node.clock_offset_s
@@ -220,7 +223,7 @@ class Fleet:
         if node.life != life or node.coordinator is None:
             return
         self.carry_out(node, node.coordinator.tick(self.local_s(node)))
-        self.at(TICK_S * self.rng.uniform(0.9, 1.1), lambda: self._tick(node, life))
+        self.at(self.tick_s * self.rng.uniform(0.9, 1.1), lambda: self._tick(node, life))
 
     # Effects.
 
@@ -265,6 +268,7 @@ class Fleet:
     def _deliver(self, sender: Node, node: Node, life: int, data: bytes, message: Message | None) -> None:
         if node.coordinator is None or node.life != life:
             return
+        node.received_messages += 1
         node.received_bytes += len(data)
         if message is None or self.is_encoded:
             try:
