@@ -42,6 +42,7 @@ EXAMPLES = """\
 EXIT_WATCHDOG_S = 12.0  # Zenoh may take 10 s to close a dead link; after that the process goes anyway
 PORTS_TRIED = 20
 PR_SET_PDEATHSIG = 1
+M_MMAP_THRESHOLD, M_ARENA_MAX = -3, -8  # of glibc's mallopt
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -61,6 +62,7 @@ def run(args: argparse.Namespace) -> int:
     if args.die_with_parent:
         die_with_parent(args.die_with_parent)
     cv2.setNumThreads(1)  # one core is for mapping; OpenCV's own threads only get in its way
+    keep_memory_small()
     stopping = StopSignals()
     node = make_node(with_devices(config), keeps_state=not args.no_state)
     stopping.then(node.stopping.set)
@@ -176,6 +178,14 @@ def exit_watchdog(stopping: threading.Event) -> Any:
     finally:
         stopping.set()
         done.set()
+
+
+def keep_memory_small() -> None:
+    """Two heaps for all threads, and large arrays given back at once: 24 MB less of 146 after half a minute of three robots."""
+    with contextlib.suppress(OSError, AttributeError):  # another C library has other habits
+        libc = ctypes.CDLL(None)
+        libc.mallopt(M_ARENA_MAX, 2)
+        libc.mallopt(M_MMAP_THRESHOLD, 1 << 20)
 
 
 def die_with_parent(parent: int) -> None:

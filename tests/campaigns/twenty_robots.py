@@ -45,21 +45,19 @@ def campaign(args: argparse.Namespace) -> dict[str, Any]:
             print(f"up: {actor.name}", file=sys.stderr)
         fleet.begin(stage)
         started = time.monotonic()
-        names, merged_s, most = [actor.name for actor in stage.robots], None, 0
-        rss_mb = 0.0
-        while time.monotonic() - started < 60 * args.minutes:
-            statuses = [fleet.status(name) for name in names]
-            fused = [status.get("global") or {} for status in statuses]
-            digests = {one.get("digest") for one in fused}
-            members = max((len(one.get("members", [])) for one in fused), default=0)
+        names, merged_s, agreed_s, most, rss_mb = [actor.name for actor in stage.robots], None, None, 0, 0.0
+        while merged_s is None and time.monotonic() - started < 60 * args.minutes:
+            members = max(len(fleet.members(name)) for name in names)
             rss_mb = max(rss_mb, *(resident_mb(fleet.agents[name].process.pid) for name in names))
             if members > most:
                 most = members
                 print(f"{time.monotonic() - started:5.0f} s: {most} robots in one map, {rss_mb:.0f} MB", file=sys.stderr)
-            if most == args.robots and len(digests) == 1:
+            if most == args.robots:
                 merged_s = time.monotonic() - started
-                break
             time.sleep(1.0)
+        if merged_s is not None:
+            agreed_s = seconds_to_one_digest(fleet, names)
+            rss_mb = max(rss_mb, *(resident_mb(fleet.agents[name].process.pid) for name in names))
         statuses = [fleet.status(name) for name in names]
         for error in sorted(
             {f"{w['name']}: {w['error']}" for status in statuses for w in status.get("workers", []) if w["error"]}
@@ -69,14 +67,26 @@ def campaign(args: argparse.Namespace) -> dict[str, Any]:
     return {
         "robots": args.robots,
         "in one map": most,
-        "one map": merged_s is not None,
-        "seconds to one digest everywhere": merged_s,
+        "one map": agreed_s is not None,
+        "seconds until all are in": merged_s,
+        "seconds to one digest everywhere, mapping paused": agreed_s,
         "largest RSS MB": rss_mb,
         "scans": sum(m["scans"] for m in mappings),
         "scans lost": sum(m["scans_lost"] for m in mappings),
         "worker errors": sum(w["errors"] for status in statuses if status for w in status["workers"]),
         "largest inbox drops": max((status["network"]["inbox_dropped"] for status in statuses if status), default=0),
     }
+
+
+def seconds_to_one_digest(fleet: Fleet, names: list[str]) -> float | None:
+    """Maps stand still; how long until every robot holds the very same global map of all."""
+    for name in names:
+        fleet.agents[name].ask("pause")
+    try:
+        return fleet.until(lambda: fleet.agree(*names), 90.0, "one digest")
+    except AssertionError as error:
+        print(str(error)[:4000], file=sys.stderr)
+        return None
 
 
 def resident_mb(pid: int) -> float:
