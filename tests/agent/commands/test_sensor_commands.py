@@ -1,0 +1,66 @@
+"""`mapquilt devices`, `scan` and `record`, on an LD06 behind a real pty."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import pytest
+
+from agent.cli import main
+from tests.harness.pty_lidar import PtyLidar
+
+
+@pytest.fixture
+def lidar(tmp_path: Path) -> Iterator[PtyLidar]:
+    lidar = PtyLidar(tmp_path / "lidar")
+    yield lidar
+    lidar.close()
+
+
+def test_scan_tells_figures_and_draws_what_it_sees(lidar: PtyLidar, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    picture = tmp_path / "scan.png"
+    assert main(["scan", f"ld06:{lidar.link}", "-n", "3", "--json", "--png", str(picture)]) == 0
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert len(lines) == 3
+    assert lines[-1]["points"] == 450 and lines[-1]["valid"] == 450 and not lines[-1]["is_partial"]
+    assert (lines[-1]["nearest_m"], sum(lines[-1]["histogram"])) == (1.704, 450)
+    image = cv2.imread(str(picture))
+    assert image.shape == (800, 800, 3)
+    middle, wall = image[400, 400].tolist(), image[300:500, 560:600]  # the room's right wall is 2.5 m away
+    assert middle[2] > 150 and middle[1] < 90, "the sensor is drawn red in the middle"
+    assert (wall.min(axis=2) < 60).any(), "a wall is drawn dark"
+
+
+def test_a_person_gets_one_line_a_second(lidar: PtyLidar, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scan", f"ld06:{lidar.link}", "-n", "3"]) == 0
+    out = capsys.readouterr().out
+    assert "LD06" in out and "450 points" in out and "100% of the circle" in out
+
+
+def test_record_and_replay(lidar: PtyLidar, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "a.rec"
+    assert main(["record", f"ld06:{lidar.link}", str(file), "--seconds", "1.2"]) == 0
+    assert "readings" in capsys.readouterr().err
+    assert main(["scan", f"replay:{file}?speed=5", "--json"]) == 0
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert len(lines) >= 4 and lines[0]["points"] == 450
+
+
+def test_devices_says_who_answers(lidar: PtyLidar, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["devices", "--probe", "--json", "--as", "ld06", str(lidar.link)]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found[0]["url"], found[0]["kind"], found[0]["model"]) == (f"ld06:{lidar.link}", "lidar", "LD06")
+    assert main(["devices", "--probe", "--as", "xv11", str(lidar.link)]) == 1
+    assert "nobody we know answers" in capsys.readouterr().out
+
+
+def test_what_cannot_work_is_said_in_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scan", "ld07:/dev/ttyUSB0"]) == 2
+    assert "is no kind of lidar" in capsys.readouterr().err
+    assert main(["scan", f"ld06:{tmp_path}/none", "--seconds", "0.3"]) == 1
+    assert "no such port" in capsys.readouterr().err
+    assert main(["record", f"ld06:{tmp_path}/none", f"{tmp_path}/no/such/folder"]) == 2
+    assert "cannot be written" in capsys.readouterr().err
