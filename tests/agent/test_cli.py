@@ -75,7 +75,11 @@ def test_global_flags_stand_before_or_behind_the_command(capsys: pytest.CaptureF
 
 def test_a_reader_that_has_seen_enough_is_no_error() -> None:
     done = subprocess.run(
-        f"{sys.executable} -m agent config show --json | head -1", shell=True, capture_output=True, text=True, check=True
+        f"{shlex.quote(sys.executable)} -m agent config show --json | head -1",
+        shell=True,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert (done.stdout, done.stderr) == ("{\n", "")
 
