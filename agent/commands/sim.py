@@ -86,7 +86,9 @@ def run(args: argparse.Namespace) -> int:
                     print(f"{path} -> {os.path.realpath(path)}  {name}; use it as {device_url(name, path)}", flush=True)
             stop.wait(None if math.isinf(args.seconds) else args.seconds)
     except OSError as error:
-        raise CommandError(f"{args.link}: {error.strerror or error}; the folder must exist and be writable", USAGE) from error
+        raise CommandError(
+            f"{args.link}: {error.strerror or error}; the folder must exist, the name must be free", USAGE
+        ) from error
     return OK
 
 

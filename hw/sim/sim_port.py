@@ -7,6 +7,7 @@ SimPort       the same device as a `Port`, for `sim:office?seed=3` and `log:run.
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import os
 import pty
@@ -55,6 +56,8 @@ class PtyLine:
 
     def plug(self) -> None:
         """The port appears, under whatever name the system gives it."""
+        if self.link.exists() and not self.link.is_symlink():
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(self.link))
         self._master, slave = pty.openpty()
         tty.setraw(slave)  # a fresh pty echoes: device bytes would come back as commands
         os.set_blocking(self._master, False)
