@@ -164,9 +164,9 @@ class Composition:
         if self._waits_for_recipes(group, now_s):
             return missing
         if now_s - self._composed_s >= self._ledger.options.compose_period_s:
+            self._composed_s = now_s
             recipe = self._recipe(group, {robot: version for robot, version in versions.items() if version is not None})
             if recipe is not None and recipe != self._made:
-                self._composed_s = now_s
                 self._fuse(recipe, now_s)
         return missing
 

@@ -332,7 +332,7 @@ class Coordinator:
             return
         if said.other == self.robot:
             self._pairs.on_proposal(peer, said, now_s)
-        peer.statements[said.other] = said
+        peer.statements[said.other], peer.statements_digest = said, None
         peer.statements_seq = max(peer.statements_seq, said.seq)
         self._after_statements(peer, [said], now_s)
 
@@ -563,7 +563,9 @@ class Coordinator:
             return
         if beat.map is not None and (peer.announcement is None or peer.announcement.map.frame != beat.map.frame):
             self._fetching.want(peer.robot, "feat", "map/feat", now_s)
-        if peer.beat_s >= peer.said_s and beat.edges_digest != statements_digest(peer.statements.values()):
+        if peer.statements_digest is None:
+            peer.statements_digest = statements_digest(peer.statements.values())
+        if peer.beat_s >= peer.said_s and beat.edges_digest != peer.statements_digest:
             self._fetching.want(peer.robot, "edges", "edges", now_s)
         meta_id = peer.meta.id() if peer.meta else NO_DIGEST
         is_wanted = peer.robot == self._composition.composer or self._composition.awaits_meta(peer.robot)

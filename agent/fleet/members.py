@@ -40,6 +40,7 @@ class Peer:
     meta: GlobalMeta | None = None
     statements: dict[str, Statement] = field(default_factory=dict)
     statements_seq: int = 0
+    statements_digest: bytes | None = None  # over `statements`; None: they changed since
     held: MapVersion | None = None  # the newest version of its cells that is here
     grid: OccupancyGrid | None = None  # the cells of `held`
     area_m2: float = 0.0  # known area of `held`
@@ -87,7 +88,7 @@ class Peer:
     def forget_words(self) -> None:
         """A new life: what the old one said is void; its cells stay, they belong to their frame."""
         self.hello = self.beat = self.announcement = self.coarse = self.meta = None
-        self.statements, self.statements_seq = {}, 0
+        self.statements, self.statements_seq, self.statements_digest = {}, 0, None
 
 
 class Roster:
@@ -176,7 +177,7 @@ def newer_statements(peer: Peer, said: Statements) -> list[Statement]:
     if said.seq < peer.statements_seq:
         return []
     before, peer.statements = peer.statements, {statement.other: statement for statement in said.statements}
-    peer.statements_seq = said.seq
+    peer.statements_seq, peer.statements_digest = said.seq, None
     after = peer.statements
     changed = [other for other in before.keys() | after.keys() if before.get(other) != after.get(other)]
     return [after[other] if other in after else before[other] for other in sorted(changed)]
