@@ -23,7 +23,7 @@ from hw.device import build_driver
 from hw.port import SerialPort
 from hw.supervisor import Device
 from hw.urls import parse_url
-from tests.harness.lidar_streams import STREAMS
+from tests.harness.lidar_streams import STREAMS, Stream
 
 SCHEMES = {"ld06": "ld19", "stl27l": "stl27l", "rplidar-0x81": "rplidar", "rplidar-0x82": "rplidar", "rplidar-0x85": "rplidar"}
 SCHEMES |= {"rplidar-0x86": "rplidar", "ydlidar-2B": "ydlidar", "xv11": "xv11", "lds01": "lds01"}
@@ -82,17 +82,18 @@ def measure(name: str, seconds: float) -> Row:
     tty.setraw(slave)
     path = os.ttyname(slave)
     stop = multiprocessing.Event()
-    sender = multiprocessing.Process(target=send, args=(name, master, stop), daemon=True)
+    stream = STREAMS[name](seconds=30.0 if name in ("ld06", "stl27l") else 2.0)
+    sender = multiprocessing.get_context("fork").Process(target=send, args=(stream, master, stop), daemon=True)
     sender.start()
     url = parse_url(f"{SCHEMES[name]}:{path}")
     # the sender answers no questions, as most LIDARs stream whether asked or not
     device = Device(url.text, build_driver(url, "lidar"), lambda baud, dtr: SerialPort(path, baud, dtr), path, is_passive=True)
     with device:
-        while device.read(5.0) is None:
-            if device.health().last_error:
-                raise SystemExit(f"{name}: {device.health().last_error}")
-        for _ in range(10):
+        deadline_s = time.monotonic() + 30.0
+        while device.health().readings < 10:
             device.read(1.0)
+            if time.monotonic() > deadline_s:
+                raise SystemExit(f"{name}: {device.health().last_error}")
         row = _watch(name, device, seconds)
     stop.set()
     sender.join(2.0)
@@ -123,9 +124,8 @@ def _watch(name: str, device: Device, seconds: float) -> Row:
     )
 
 
-def send(name: str, master: int, stop: Event) -> None:
+def send(stream: Stream, master: int, stop: Event) -> None:
     """The device: its bytes, at its pace, in millisecond portions."""
-    stream = STREAMS[name](seconds=30.0 if name in ("ld06", "stl27l") else 2.0)
     data = stream.data
     begin_s, at = time.monotonic(), 0
     prefix_until_s = begin_s + 1.0 if stream.prefix else 0.0
