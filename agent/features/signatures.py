@@ -91,6 +91,8 @@ def _sampled(
     at = angles[:, None] + bearing[None, :]
     x = (positions[:, :1] + radius * np.cos(at)) / resolution_m - 0.5
     y = (positions[:, 1:] + radius * np.sin(at)) / resolution_m - 0.5
+    if not len(positions):
+        return np.zeros((0, len(radius)), np.float32), np.zeros((0, len(radius)), np.float32)
     far, border = 9.0, cv2.BORDER_CONSTANT
     distance = cv2.remap(distance_m, x, y, cv2.INTER_NEAREST, borderMode=border, borderValue=far)
     seen = cv2.remap(known.astype(np.float32), x, y, cv2.INTER_NEAREST, borderMode=border, borderValue=0)

@@ -16,6 +16,7 @@ from agent.features.corners import Corners, corners_of
 from agent.features.directions import direction_spectrum
 from agent.features.extraction import feature_map
 from agent.features.field import UNKNOWN_BYTE, MatchField
+from agent.features.incremental import updated_walls
 from agent.features.lines import WallLines, wall_lines
 from agent.features.signatures import Signatures, signatures_of
 from agent.features.structure import structure_kinds
@@ -38,9 +39,12 @@ class MapSnapshot:
     def of(grid: OccupancyGrid) -> MapSnapshot:
         return MapSnapshot(grid)
 
-    def updated(self, grid: OccupancyGrid, changed: object = None) -> MapSnapshot:
-        """The snapshot of a later state of the same map."""
-        return MapSnapshot(grid)
+    def updated(self, grid: OccupancyGrid) -> MapSnapshot:
+        """The snapshot of a later state of the same map: what did not change is not fitted again."""
+        later = MapSnapshot(grid)
+        if "walls" in self.__dict__:
+            later.__dict__["walls"] = updated_walls(self.grid, self.working, self.walls, grid, later.working)
+        return later
 
     def kept(self, key: Hashable, make: Callable[[MapSnapshot], T]) -> T:
         """What `make` derives from this snapshot, made once: rooms above keep their own views of a map here."""

@@ -20,7 +20,8 @@ from agent.features.working import WorkingGrid
 WINDOW_M = 0.45  # radius in which the local line is fitted: shorter is noisy, longer rounds corners off
 ACROSS_CELLS = 1.0  # cells of a wall beside a point: more would mix in its far side
 SPACING_M = 0.20  # one point stands for this much wall
-MAX_SURFACE_CELLS = 150_000  # a checkerboard is all surface; a 250 m campus has 40,000
+MAX_THIN_POINTS = 20_000  # 4 km of wall; cv2.remap takes fewer than 2^15 columns
+MAX_SURFACE_CELLS = 60_000  # a checkerboard is all surface; a 250 m campus has 7,000
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +51,7 @@ class WallPoints:
         first = np.ones(len(order), np.bool_)
         first[1:] = np.diff(key[order]) != 0
         rows: NDArray[np.int64] = np.sort(order[first])
-        return rows
+        return rows[:: -(-max(1, len(rows)) // MAX_THIN_POINTS)]
 
     def subset(self, index: NDArray[np.int64]) -> WallPoints:
         return WallPoints(self.cells_rc[index], self.positions_m[index], self.normals[index], self.linearity[index])
@@ -119,6 +120,11 @@ def _shift(
     return shift
 
 
+def reach_cells(resolution_m: float) -> int:
+    """How many cells away a fit looks, in rows and columns."""
+    return int(max(WINDOW_M, 2.3 * resolution_m) / resolution_m)
+
+
 def _touches_edge(cells: NDArray[np.int32], reach: int, rows: int, cols: int) -> bool:
     return bool(len(cells)) and not bool(
         (cells.min(axis=0) >= reach).all() and (cells.max(axis=0) < (rows - reach, cols - reach)).all()
@@ -128,7 +134,7 @@ def _touches_edge(cells: NDArray[np.int32], reach: int, rows: int, cols: int) ->
 def _window(resolution_m: float) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """(K, 2) cell offsets (row, col) within the window and their weights."""
     radius_m = max(WINDOW_M, 2.3 * resolution_m)
-    n = int(radius_m / resolution_m)
+    n = reach_cells(resolution_m)
     dy, dx = np.mgrid[-n : n + 1, -n : n + 1]
     d2 = (dx * dx + dy * dy) * (resolution_m / radius_m) ** 2
     keep = d2 <= 1.0

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from protocol.grid import FREE, OCCUPIED, OccupancyGrid
 
 WORKING_RESOLUTION_M = 0.10  # finer cells cost four times the work and gain no accuracy: walls are fitted below the cell
+MAX_WORKING_SIDE = 32_000  # cv2.remap reads images of fewer than 2^15 rows and columns
 MAX_WORKING_CELLS = 16_000_000  # a 400 m square; larger maps are worked on with coarser cells
 
 
@@ -42,7 +43,7 @@ class WorkingGrid:
 
 def _factor(grid: OccupancyGrid) -> int:
     factor = max(1, int(WORKING_RESOLUTION_M / grid.resolution_m + 1e-6))
-    while grid.cells.size > MAX_WORKING_CELLS * factor * factor:
+    while grid.cells.size > MAX_WORKING_CELLS * factor * factor or max(grid.cells.shape) > MAX_WORKING_SIDE * factor:
         factor += 1
     return factor
 
@@ -53,3 +54,14 @@ def _block_sums(mask: NDArray[np.uint8], k: int) -> NDArray[np.int32]:
     padded = np.pad(mask, ((0, -h % k), (0, -w % k)))
     by_rows = np.add.reduceat(padded, np.arange(0, padded.shape[0], k), axis=0, dtype=np.int32)
     return np.add.reduceat(by_rows, np.arange(0, padded.shape[1], k), axis=1, dtype=np.int32)
+
+
+def shift_between(old_grid: OccupancyGrid, old: WorkingGrid, new_grid: OccupancyGrid, new: WorkingGrid) -> tuple[int, int] | None:
+    """(rows, columns) that take a working cell of the old map to the new one; None when they lie on different lattices."""
+    if old_grid.resolution_m != new_grid.resolution_m or old.resolution_m != new.resolution_m:
+        return None
+    T_new_old = new_grid.origin.inverse() @ old_grid.origin
+    rows, cols = T_new_old.y_m / new.resolution_m, T_new_old.x_m / new.resolution_m
+    if abs(T_new_old.theta_rad) > 1e-12 or max(abs(rows - round(rows)), abs(cols - round(cols))) > 1e-6:
+        return None
+    return round(rows), round(cols)

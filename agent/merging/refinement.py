@@ -9,13 +9,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from agent.features.field import MatchField
 from agent.features.wall_points import WallPoints
-from agent.merging.scoring import placed
+from agent.merging.scoring import looked_up, placed
 from agent.merging.transforms import Poses, inverted
 
 SIGMA_M = 0.05  # how far wall points of two good maps lie apart
@@ -116,7 +115,7 @@ def normal_equations(ours: Side, theirs: Side, poses: Poses, gate_m: float) -> N
 def _partners(points: Side, lines: Side, poses: Poses) -> tuple[_Floats, ...]:
     """Points (1, P), and for every candidate the nearest wall point of the other map (C, P) with its normal."""
     columns, rows = placed(points.xy1, poses, lines.field.resolution_m)
-    found = cv2.remap(lines.field.nearest, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=-1)
+    found = looked_up(lines.field.nearest, columns, rows, outside=-1)
     index = found.astype(np.int32)
     q, n = lines.wall_xy[index], lines.wall_normals[index]
     own = points.normals.T

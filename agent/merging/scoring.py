@@ -8,18 +8,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.features.field import DIRECTION_BINS, FREE_BYTE
+from agent.features.field import DIRECTION_BINS, FREE_BYTE, UNKNOWN_BYTE
 from agent.features.structure import LOOSE
 from agent.features.wall_points import SPACING_M, WallPoints, direction_bins
 from agent.merging.transforms import Poses
 
 AGREE_BINS = 9  # normals within 51 degrees agree: corners and clutter turn normals, walls of a corridor differ by 180
 OPPOSITE_BINS = 23  # beyond 129 degrees: perhaps the far side of a thin wall
+Pixel = TypeVar("Pixel", np.uint8, np.float32)
 _BLOCK = 400_000  # points at a time, so that temporaries stay in cache
 
 
@@ -88,13 +90,23 @@ SEARCH_WORTH = worth_table(
 def readings(field: NDArray[np.uint8], resolution_m: float, probe: Probe, poses: Poses) -> NDArray[np.uint16]:
     """(C, P) kind, field byte and direction bin of every point under every transform, as one table index."""
     x, y = placed(probe.xy1, poses, resolution_m)
-    seen = cv2.remap(field, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=255)
+    seen = looked_up(field, x, y, outside=UNKNOWN_BYTE)
     turn = np.rint(poses[:, 2] * (DIRECTION_BINS / math.tau)).astype(np.int64).astype(np.uint8)
     index: NDArray[np.uint16] = seen.astype(np.uint16)
     index <<= 6
     index |= (probe.bins[None, :] + turn[:, None]) & 63
     index |= probe.kinds[None, :]
     return index
+
+
+def looked_up(image: NDArray[Pixel], columns: NDArray[np.float32], rows: NDArray[np.float32], outside: float) -> NDArray[Pixel]:
+    """The image at many places at once, nearest pixel; none asked, none told (cv2 refuses to be asked nothing)."""
+    if not columns.size:
+        return np.zeros(columns.shape, image.dtype)
+    found: NDArray[Pixel] = cv2.remap(
+        image, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=outside
+    )
+    return found
 
 
 def placed(xy1: NDArray[np.float32], poses: Poses, resolution_m: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

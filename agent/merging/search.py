@@ -50,6 +50,8 @@ def search(ours: MapSnapshot, theirs: MapSnapshot, effort: Effort) -> tuple[Pose
     found = list(_sources(ours, theirs, effort))
     tried = sum(len(poses) for poses in found)
     poses = np.concatenate([_coarsely_best(ours, theirs, poses, effort.scored) for poses in found])
+    if not len(poses):
+        return poses, tried
     poses = poses[np.argsort(-_both_ways(ours, theirs, poses, "coarse"), kind="stable")[: effort.drawn]]
     poses = refined(side(ours, _FEW), side(theirs, _FEW), poses, _ROUGH_GATES_M)
     poses = poses[distinct(poses, _both_ways(ours, theirs, poses, "fine"), theirs.middle_m, effort.kept)]

@@ -13,7 +13,18 @@ from agent.features.structure import ATTACHED, LOOSE, SHORT
 from agent.features.wall_points import SPACING_M, WallPoints
 from agent.features.working import WorkingGrid
 from agent.merging.result import MatchFactor
-from agent.merging.scoring import AGREES, CONFLICTS, CROSSES, OPPOSITE, Probe, outcome_table, placed, readings, worth_table
+from agent.merging.scoring import (
+    AGREES,
+    CONFLICTS,
+    CROSSES,
+    OPPOSITE,
+    Probe,
+    looked_up,
+    outcome_table,
+    placed,
+    readings,
+    worth_table,
+)
 from agent.merging.transforms import Poses, inverted
 
 OUTCOMES = np.tile(outcome_table().ravel(), 4)
@@ -86,7 +97,7 @@ def doubts(ours: Witness, theirs: Witness, pose: NDArray[np.float64]) -> tuple[f
         opposite += np.count_nonzero(firm & (outcome == OPPOSITE))
         alone = (points.kinds >= SHORT) & (outcome == CONFLICTS)
         x, y = placed(points.probe.xy1[:, alone], T, on.field.resolution_m)
-        away = cv2.remap(on.field.distance_m, x, y, cv2.INTER_NEAREST, borderValue=0) if alone.any() else np.zeros(0)
+        away = looked_up(on.field.distance_m, x, y, outside=0)
         deep += np.count_nonzero(away > DEEP_M)
     agreeing = max(agreeing, 0.5)
     return float(attached[0] / max(attached[1], 0.5)), float(deep / agreeing), float(opposite / agreeing)

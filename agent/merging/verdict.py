@@ -21,11 +21,14 @@ MAX_RIVAL_SHARE = 0.72  # of the best score
 MIN_AGREEING_SHARE = 0.5  # of firm wall that says anything; half is a bar that only vegetation comes near
 MIN_YIELD = 0.15  # score per metre it would be without anything against
 MIN_OBSERVABILITY_M = 2.0
+MIN_OBSERVABLE_SHARE = 0.1  # of agreeing wall: along a long corridor two metres of cross wall are an accident
 MIN_AGREEING_M = 8.0
 USUAL_FACTOR = 0.95  # of true transforms at 10 cm
-FACTOR_SLOPE = 0.4  # coarser cells disagree more at the truth, by this a metre of cell
+FACTOR_SLOPE = 0.3  # coarser cells disagree more at the truth, by this a metre of cell
 MAX_SUSPICION = 1.1
-MAX_OPPOSITE_SHARE = 0.5  # thin walls seen from both sides make 0.1 to 0.4; a mirrored plan 0.6 to 1
+UNSUSPICIOUS = 0.5  # most true pairs lie below; above it more margin is asked for
+MARGIN_PER_SUSPICION_M = 5.0
+MAX_OPPOSITE_SHARE = 0.6  # thin walls seen from both sides make 0.1 to 0.5; a mirrored plan up to 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,9 +71,10 @@ def verdict(grounds: Grounds, options: MatchOptions) -> tuple[MatchStatus, str]:
         return MatchStatus.NO, Reason.CONFLICTS
     if g.factor < options.min_match_factor:
         return MatchStatus.NO, Reason.LOW_MATCH_FACTOR
-    if g.observability_m <= MIN_OBSERVABILITY_M:
+    if g.observability_m <= max(MIN_OBSERVABILITY_M, MIN_OBSERVABLE_SHARE * g.agreeing_m):
         return MatchStatus.AMBIGUOUS, Reason.UNOBSERVABLE
-    if g.score - g.rival <= options.min_margin_m or g.rival >= MAX_RIVAL_SHARE * g.score:
+    needed_m = options.min_margin_m + MARGIN_PER_SUSPICION_M * max(0.0, g.suspicion - UNSUSPICIOUS)
+    if g.score - g.rival <= needed_m or g.rival >= MAX_RIVAL_SHARE * g.score:
         return MatchStatus.AMBIGUOUS, Reason.RIVAL
     if g.suspicion > MAX_SUSPICION or g.opposite_share > MAX_OPPOSITE_SHARE:
         return MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE
