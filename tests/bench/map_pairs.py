@@ -89,12 +89,12 @@ def _walk(world: World, start: SE2, walk_m: float, rng: np.random.Generator) -> 
     ways = Ways(clearance, radius_m)
     at, walked, places = (start.x_m, start.y_m), 0.0, [(start.x_m, start.y_m)]
     while walked < walk_m:
-        lengths, came = ways.lengths_from(at)
+        lengths = ways.lengths_from(at)
         rows, cols = np.nonzero(np.isfinite(lengths) & (lengths > 3) & (lengths < 20))
         if not len(rows):
             break
         goal = int(rng.integers(len(rows)))
-        path = np.array(ways.path(came, (int(rows[goal]), int(cols[goal])), radius_m))
+        path = np.array(ways.path(lengths, (int(rows[goal]), int(cols[goal])), radius_m))
         steps = np.hypot(*np.diff(path, axis=0).T)
         along = np.arange(SCAN_EVERY_M, steps.sum(), SCAN_EVERY_M)
         done = np.concatenate([[0], np.cumsum(steps)])
