@@ -16,7 +16,7 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import cv2
@@ -193,16 +193,18 @@ FAULTS: dict[str, Callable[[Readings], Readings]] = {
 }
 
 
-def rows_of(name: str, seeds: list[int], particles: int, faults: bool) -> list[dict[str, object]]:
+def rows_of(name: str, seeds: list[int], particles: int, faults: bool) -> Iterator[dict[str, object]]:
+    """Row by row, as they are measured."""
     recording = recordings.load(name)
     if faults:
-        return [
-            {"fault": fault, **run(recording, change(recording.readings), seed, particles)}
-            for fault, change in FAULTS.items()
-            for seed in seeds
-        ]
-    rows = [run(recording, recording.readings, seed, particles) for seed in seeds]
-    return [*rows, {"log": name, "seed": "reference", **scores(recording, reference(recording))}]
+        for fault, change in FAULTS.items():
+            readings = change(recording.readings)
+            for seed in seeds:
+                yield {"fault": fault, **run(recording, readings, seed, particles)}
+        return
+    for seed in seeds:
+        yield run(recording, recording.readings, seed, particles)
+    yield {"log": name, "seed": "reference", **scores(recording, reference(recording))}
 
 
 def print_row(row: dict[str, object], columns: list[str]) -> None:
