@@ -21,7 +21,7 @@ from agent.merging.result import MatchOptions, MergeResult
 from protocol.grid import OccupancyGrid
 
 MAX_JOBS = 64
-MAX_SNAPSHOTS = 10  # a few MB each
+MAX_SNAPSHOTS = 6  # a few MB each: ours, and the peers whose turn it is
 WAIT_S = 0.25
 
 RANK = {MatchKind.VERIFY: 1, MatchKind.COARSE: 2, MatchKind.SEARCH: 3}
