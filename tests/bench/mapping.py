@@ -225,7 +225,8 @@ def main() -> None:
     if not (recordings.SHARED / "data" / "carmen").is_dir():
         sys.exit(f"no recordings in {recordings.SHARED / 'data' / 'carmen'}; set MAPQUILT_SHARED to the folder that holds data/")
     logs = "intel" if arguments.faults and arguments.logs == LOGS else arguments.logs
-    every, columns = [], []
+    every: list[dict[str, object]] = []
+    columns: list[str] = []
     for name in logs.split(","):
         for row in rows_of(name, [int(s) for s in arguments.seeds.split(",")], arguments.particles, arguments.faults):
             every.append(row)
