@@ -123,7 +123,7 @@ def table(tallies: list[Tally], share: float) -> str:
             else f"{t.wrong_beams} beams, {t.wrong_beams / max(1, t.damaged_bytes):.2f} a damaged byte"
         )
         lines.append(
-            f"| {t.protocol} | {t.robot_hours:.0f} | {t.damaged_bytes:,} | {t.frames:,} | {t.refused_frames:,} "
+            f"| {t.protocol} | {t.robot_hours:.1f} | {t.damaged_bytes:,} | {t.frames:,} | {t.refused_frames:,} "
             f"| {t.scans:,} ({t.partial_scans:,}) | {wrong} | {100 * t.worst_error_m:.1f} cm |"
         )
     return "\n".join(lines)
