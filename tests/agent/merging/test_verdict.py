@@ -1,0 +1,47 @@
+"""The verdict on grounds that miss one thing each."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from agent.merging.result import MatchOptions, MatchStatus, Reason
+from agent.merging.verdict import Grounds, verdict
+
+GOOD = Grounds(
+    score=40.0,
+    rival=5.0,
+    agreeing_m=50.0,
+    against_m=5.0,
+    potential_m=45.0,
+    observability_m=15.0,
+    factor=0.97,
+    cell_m=0.1,
+    attached_doubt=0.05,
+    deep_doubt=0.01,
+    opposite_share=0.1,
+)
+
+
+def test_good_grounds_merge() -> None:
+    assert verdict(GOOD, MatchOptions()) == (MatchStatus.MERGED, Reason.MATCHED)
+
+
+@pytest.mark.parametrize(
+    ("change", "status", "reason"),
+    [
+        ({"agreeing_m": 7.0}, MatchStatus.NO, Reason.LITTLE_WALL),
+        ({"score": 6.0}, MatchStatus.NO, Reason.LITTLE_WALL),
+        ({"against_m": 60.0}, MatchStatus.NO, Reason.CONFLICTS),
+        ({"factor": 0.84}, MatchStatus.NO, Reason.LOW_MATCH_FACTOR),
+        ({"observability_m": 1.5}, MatchStatus.AMBIGUOUS, Reason.UNOBSERVABLE),
+        ({"observability_m": 4.0}, MatchStatus.AMBIGUOUS, Reason.UNOBSERVABLE),
+        ({"rival": 35.0}, MatchStatus.AMBIGUOUS, Reason.RIVAL),
+        ({"rival": 30.0}, MatchStatus.AMBIGUOUS, Reason.RIVAL),
+        ({"opposite_share": 0.8}, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
+        ({"factor": 0.90, "attached_doubt": 0.6, "deep_doubt": 0.05}, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
+    ],
+)
+def test_one_thing_missing_does_not(change: dict[str, float], status: MatchStatus, reason: str) -> None:
+    assert verdict(replace(GOOD, **change), MatchOptions()) == (status, reason)
