@@ -52,8 +52,11 @@ def _block_sums(mask: NDArray[np.uint8], k: int) -> NDArray[np.int32]:
     """Sums over k x k blocks; the last row and column of blocks may hang over the edge."""
     h, w = mask.shape
     padded = np.pad(mask, ((0, -h % k), (0, -w % k)))
-    by_rows = np.add.reduceat(padded, np.arange(0, padded.shape[0], k), axis=0, dtype=np.int32)
-    return np.add.reduceat(by_rows, np.arange(0, padded.shape[1], k), axis=1, dtype=np.int32)
+    sums = np.zeros((padded.shape[0] // k, padded.shape[1] // k), np.int32)
+    for row in range(k):
+        for col in range(k):
+            sums += padded[row::k, col::k]
+    return sums
 
 
 def shift_between(old_grid: OccupancyGrid, old: WorkingGrid, new_grid: OccupancyGrid, new: WorkingGrid) -> tuple[int, int] | None:
