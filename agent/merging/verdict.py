@@ -28,7 +28,7 @@ FACTOR_SLOPE = 0.3  # coarser cells disagree more at the truth, by this a metre 
 MAX_SUSPICION = 1.0
 UNSUSPICIOUS = 0.5  # most true pairs lie below; above it more margin is asked for
 MARGIN_PER_SUSPICION_M = 5.0
-MAX_OPPOSITE_SHARE = 0.6  # thin walls seen from both sides make 0.1 to 0.5; a mirrored plan up to 1
+MAX_OPPOSITE_SHARE = 0.55  # thin walls seen from both sides make 0.1 to 0.5; a mirrored plan up to 1
 
 
 @dataclass(frozen=True, slots=True)
