@@ -20,9 +20,9 @@ from tests.agent.mapping.worlds import CORRIDOR, ROOMS, scan_at
 WEAK = information(1.0, 1.0)
 
 
-def points_at(world: np.ndarray, pose: SE2, seed: int = 0) -> ScanPoints:
+def points_at(world: np.ndarray, pose: SE2, seed: int = 0, range_m: float = 10.0) -> ScanPoints:
     scan = scan_at(world, pose, 0.0, np.random.default_rng(seed), beams=360)
-    return scan_points(scan, OdometryTrack(3.0, 6.0), MappingOptions(matching_range_m=10.0))
+    return scan_points(scan, OdometryTrack(3.0, 6.0), MappingOptions(matching_range_m=range_m))
 
 
 def field_of(points: ScanPoints, copies: int = 1) -> TiledFields:
@@ -55,8 +55,8 @@ def test_all_particles_at_once_are_each_one_alone() -> None:
 
 
 def test_a_corridor_leaves_its_own_direction_open_and_the_prior_decides_there() -> None:
-    fields = field_of(points_at(CORRIDOR, SE2(0.0, 0.0, 0.0)))
-    moved = points_at(CORRIDOR, SE2(0.1, 0.0, 0.0), seed=1)
+    fields = field_of(points_at(CORRIDOR, SE2(0.0, 0.0, 0.0), range_m=6.0))
+    moved = points_at(CORRIDOR, SE2(0.1, 0.0, 0.0), seed=1, range_m=6.0)
     prior = np.array([[0.1, 0.0, 0.0]])
     fit = refine(fields, np.zeros(1, int), prior, prior, information(0.05, 0.02)[None], moved.surfels)
     ratio, direction = weakest_direction(fit.curvature[0])
