@@ -29,6 +29,7 @@ from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 TILE_CELLS = 64
 TILE_BYTES = 13 * TILE_CELLS  # ceil(64 / 5) rows of bytes
 MAX_TILES = 16_384  # 67 million cells: 410 m x 410 m at 5 cm
+MAX_MAP_CELLS = MAX_TILES * TILE_CELLS**2  # of a whole map, told to somebody on this machine
 MAX_TILE_INDEX = 2**15 - 1
 MAX_GRID_CELLS = 4_194_304  # a whole grid in one piece: the coarse map of 410 m x 410 m at 20 cm
 ZLIB_LEVEL = 6  # 9 gains 5 % for eight times the time
@@ -49,10 +50,10 @@ def pack_cells(cells: NDArray[np.int8]) -> bytes:
     return zlib.compress(_pack_trits(_trits(cells)).tobytes(), ZLIB_LEVEL)
 
 
-def unpack_cells(data: bytes, height: int, width: int) -> NDArray[np.int8]:
+def unpack_cells(data: bytes, height: int, width: int, most_cells: int = MAX_GRID_CELLS) -> NDArray[np.int8]:
     """The (H, W) cells of `pack_cells`; anything but exactly these is a `RemoteProtocolError`."""
-    if not (height >= 1 and width >= 1 and height * width <= MAX_GRID_CELLS):
-        raise TooLarge(f"grid of {height} x {width} cells; 1 to {MAX_GRID_CELLS} cells are allowed")
+    if not (height >= 1 and width >= 1 and height * width <= most_cells):
+        raise TooLarge(f"grid of {height} x {width} cells; 1 to {most_cells} cells are allowed")
     rows = -(-height // 5)
     packed = np.frombuffer(inflate(data, rows * width), np.uint8).reshape(rows, width)
     _check_packed(packed)

@@ -20,7 +20,7 @@ from agent.runtime.latest import Latest
 from agent.runtime.metrics import metrics
 from protocol.geometry import SE2
 from protocol.grid import OccupancyGrid
-from protocol.tiles import pack_cells, unpack_cells
+from protocol.tiles import MAX_MAP_CELLS, pack_cells, unpack_cells
 
 if TYPE_CHECKING:
     from agent.runtime.node import Node
@@ -184,7 +184,7 @@ def packed_map(version: str, grid: OccupancyGrid) -> dict[str, Any]:
 
 
 def unpacked_map(packed: Mapping[str, Any]) -> OccupancyGrid:
-    cells = unpack_cells(base64.b64decode(packed["cells"]), packed["height"], packed["width"])
+    cells = unpack_cells(base64.b64decode(packed["cells"]), packed["height"], packed["width"], MAX_MAP_CELLS)
     return OccupancyGrid(cells, packed["resolution_m"], SE2(*packed["origin"]))
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from protocol.errors import LocalProtocolError, RemoteProtocolError, TooLarge
 from protocol.geometry import SE2
 from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from protocol.tiles import MAX_GRID_CELLS, TILE_BYTES, TileDelta, TileMap, inflate, pack_cells, unpack_cells
+from protocol.tiles import MAX_GRID_CELLS, MAX_MAP_CELLS, TILE_BYTES, TileDelta, TileMap, inflate, pack_cells, unpack_cells
 from tests.protocol.examples import small_grid
 
 VALUES = np.array([UNKNOWN, FREE, OCCUPIED], np.int8)
@@ -148,3 +148,11 @@ def test_impossible_sizes_are_refused_before_anything_is_allocated(height: int, 
 def test_a_grid_with_other_values_may_not_travel() -> None:
     with pytest.raises(LocalProtocolError):
         TileMap.of(OccupancyGrid(np.full((3, 3), 50, np.int8), 0.05))
+
+
+def test_a_map_larger_than_a_message_may_be_can_be_told_on_this_machine() -> None:
+    cells = np.zeros((2048, 2560), np.int8)
+    packed = pack_cells(cells)
+    with pytest.raises(TooLarge):
+        unpack_cells(packed, *cells.shape)
+    assert np.array_equal(unpack_cells(packed, *cells.shape, MAX_MAP_CELLS), cells)
