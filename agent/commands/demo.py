@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
         except DeviceConfigError as error:
             raise CommandError(str(error), USAGE) from error
         if args.duration is None:
-            args.duration = stage.time_limit_s() if args.world.startswith("log:") else DURATION_S
+            args.duration = stage.duration_s() or DURATION_S
         fleet = Fleet(stack, stage, folder)
         try:
             fleet.start()

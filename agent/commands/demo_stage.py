@@ -25,7 +25,7 @@ from protocol.grid import OccupancyGrid
 REPLAY_SPEED = 8.0  # a recording of half an hour in a minute: scans come at about 9 Hz
 REPLAY_V_MAX_MPS = 50
 MERGE_WITHIN_S = 50.0
-SETTLE_S = 5.0  # after the last recorded scan, for the last maps to travel
+SETTLE_S = 25.0  # after the last recorded scan, for the last and largest maps to be compared and to travel
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +54,9 @@ class Stage(Protocol):
     def __exit__(self, *exc: object) -> None: ...
 
     def begin(self) -> None: ...
+
+    def duration_s(self) -> float | None:
+        """From `begin` until there is nothing new to sense; None: as long as one likes."""
 
     def time_limit_s(self) -> float:
         """From `begin` until nothing new is worth waiting for."""
@@ -102,6 +105,10 @@ class SimulatedStage:
         """The robots drive off."""
         for robot in self._by_name.values():
             robot.begin()
+
+    def duration_s(self) -> float | None:
+        """Exploring never ends by itself."""
+        return None
 
     def time_limit_s(self) -> float:
         """Long enough for any two rooms' worth of map to meet, short enough for the demo to end within a minute."""
@@ -152,8 +159,12 @@ class RecordedStage:
         for replay in self._replays:
             replay.begin(now_s)
 
+    def duration_s(self) -> float | None:
+        """To the last scan of the longest part."""
+        return max(replay.duration_s for replay in self._replays)
+
     def time_limit_s(self) -> float:
-        """A while after the last scan of the longest part."""
+        """A while after the last scan."""
         return max(replay.duration_s for replay in self._replays) + SETTLE_S
 
     def truth(self) -> OccupancyGrid | None:
