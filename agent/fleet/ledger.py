@@ -10,6 +10,8 @@ from agent.fleet.frame_graph import Edge, Group, Layout, solve
 from agent.fleet.members import Peer, Roster
 from agent.fleet.options import FleetOptions
 from agent.fleet.own_map import OwnMap
+from agent.fleet.timetable import Clock, Timetable
+from protocol.geometry import SE2, wrap_angle
 from protocol.messages import NO_DIGEST, Evidence, Message, Stance, Statement
 
 PairKey = tuple[str, str]  # (smaller id, larger id)
@@ -32,6 +34,8 @@ class Ledger:
         self.layout = Layout()
         self.is_layout_old = False
         self.effects: list[Effect] = []
+        self.clock, self.timetable = Clock(), Timetable()
+        self.counts: dict[str, int] = {}
         self._next_id = 0
 
     @property
@@ -71,6 +75,21 @@ class Ledger:
         frames = self.frame_of(evidence.robot_a), self.frame_of(evidence.robot_b)
         return frames == (evidence.map_a.frame, evidence.map_b.frame)
 
+    def from_our_side(self, evidence: Evidence) -> SE2:
+        """T_ours_theirs of evidence about a pair of ours."""
+        return evidence.T_a_b if self.robot == evidence.robot_a else evidence.T_a_b.inverse()
+
+    def is_same(self, T: SE2 | None, other: SE2) -> bool:
+        """Whether two transforms of one pair mean the same."""
+        if T is None:
+            return False
+        turn_rad = abs(wrap_angle(T.theta_rad - other.theta_rad))
+        return T.distance_m(other) < self.options.same_transform_m and turn_rad < self.options.same_transform_rad
+
+    def renew_period_s(self) -> float:
+        """Everybody hears every renewal, so large fleets renew less often."""
+        return self.options.renew_period_s * max(1.0, len(self.peers) / self.options.max_beats_per_s)
+
     def statement(self, author: str, other: str) -> Statement | None:
         if author == self.robot:
             return self.mine.get(other)
@@ -103,14 +122,28 @@ class Ledger:
         for other in others:
             self.judge_pair(robot, other, now_s)
 
-    def lay_out(self) -> None:
-        """Solve the frames anew when an edge was born or died."""
-        if self.is_layout_old:
-            self.is_layout_old = False
-            self.layout = solve(
-                Edge(e.robot_a, e.robot_b, e.T_a_b, e.covariance, e.overlap_m2 * e.match_factor, e.id())
-                for e in self.live.values()
-            )
+    def lay_out(self, now_s: float) -> None:
+        """Solve the frames anew when an edge was born or died, and name the edges that came to contradict the others."""
+        if not self.is_layout_old:
+            return
+        self.is_layout_old = False
+        before = self.layout
+        self.layout = solve(
+            Edge(e.robot_a, e.robot_b, e.T_a_b, e.covariance, e.overlap_m2 * e.match_factor, e.id()) for e in self.live.values()
+        )
+        if self.layout is before:
+            return
+        known = {edge.id for edge in before.rejected}
+        for edge in self.layout.rejected:
+            if edge.id not in known:
+                self.note("edge-contradicts-loops", is_warning=True, a=edge.a, b=edge.b)
+        self.timetable.next_scan_s = now_s
+
+    def count(self, what: str) -> int:
+        """One more of these; for status pages, bounded."""
+        if what in self.counts or len(self.counts) < 200:
+            self.counts[what] = self.counts.get(what, 0) + 1
+        return self.counts.get(what, 0)
 
 
 def supported(statement: Statement) -> set[bytes]:

@@ -64,6 +64,15 @@ class Peer:
         return spoken[0] if spoken else None
 
     @property
+    def is_in_frame(self) -> bool:
+        """Whether we hold cells of the map it draws now."""
+        return self.held is not None and self.map is not None and self.held.frame == self.map.frame
+
+    def holds(self, version: MapVersion) -> bool:
+        """Whether we hold this version or a later one of the same map."""
+        return self.held is not None and self.held.frame == version.frame and self.held.revision >= version.revision
+
+    @property
     def is_frozen(self) -> bool:
         said = self.beat or self.announcement
         return said is not None and said.is_frozen

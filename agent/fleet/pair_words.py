@@ -1,0 +1,93 @@
+"""What we say about each pair, and how we take what the other side says.
+
+A statement stands until it is replaced.  An edge lives only while both sides stand by the same evidence, so saying less is
+always safe: a withdrawal needs nobody's consent.
+"""
+
+from __future__ import annotations
+
+from agent.fleet.ledger import Ledger, supported
+from agent.fleet.members import Peer
+from agent.fleet.pair import Attempt, Pair
+from protocol.messages import NO_DIGEST, Evidence, Stance, Statement
+
+
+class PairWords:
+    """The table of all pairs, and our statements about them."""
+
+    def __init__(self, ledger: Ledger) -> None:
+        self._ledger = ledger
+        self.pairs: dict[str, Pair] = {}
+
+    def pair(self, peer: str) -> Pair:
+        return self.pairs.setdefault(peer, Pair(peer))
+
+    def say(self, other: str, stance: Stance, evidence: Evidence, holds: bytes, reason: str) -> None:
+        """Change our statement about a pair, and publish it."""
+        ledger = self._ledger
+        ledger.seq += 1
+        holds = NO_DIGEST if holds == evidence.id() else holds
+        readable = "".join(c for c in reason if c.isprintable())[:80]
+        statement = Statement(ledger.robot, ledger.boot, ledger.seq, other, stance, evidence, holds, readable)
+        ledger.mine[other] = statement
+        self.pair(other).boot = ledger.peers[other].boot
+        ledger.send(statement)
+
+    def withdraw(self, other: str, reason: str, now_s: float) -> None:
+        """What we said about this pair no longer holds."""
+        mine = self._ledger.mine.get(other)
+        if mine is None or mine.stance is Stance.WITHDRAW:
+            return
+        pair = self.pair(other)
+        pair.phase, pair.reason, pair.failures, pair.is_urgent = "withdrawn", reason, 0, False
+        peer = self._ledger.peers.get(other)
+        area_m2 = self._ledger.own.known_area_m2 + (peer.known_area_m2 if peer else 0.0)
+        pair.search = pair.loop = Attempt(now_s, area_m2)
+        self.say(other, Stance.WITHDRAW, mine.evidence, NO_DIGEST, reason)
+        self._ledger.note("withdrawn", peer=other, reason=reason)
+
+    def on_proposal(self, peer: Peer, said: Statement, now_s: float) -> None:
+        """An honest robot does not propose one transform, and then quite another, on the very same maps."""
+        before = peer.statements.get(self._ledger.robot)
+        if before is None or before.stance is not Stance.PROPOSE or said.stance is not Stance.PROPOSE:
+            return
+        old, new = before.evidence, said.evidence
+        if (old.map_a, old.map_b) == (new.map_a, new.map_b) and not self._ledger.is_same(old.T_a_b, new.T_a_b):
+            self.strike(peer, "false proposal", now_s)
+
+    def on_said(self, peer: Peer, now_s: float) -> None:
+        """The other side spoke about us: answer a withdrawal, take note of a refusal."""
+        said = peer.statements.get(self._ledger.robot)
+        mine = self._ledger.mine.get(peer.robot)
+        if said is None or mine is None or mine.stance not in (Stance.PROPOSE, Stance.ACK):
+            return
+        if said.stance in (Stance.WITHDRAW, Stance.REJECT) and not supported(mine) & supported(said):
+            is_about_ours = said.evidence.id() in (mine.evidence.id(), mine.holds)
+            if is_about_ours:
+                self.withdraw(peer.robot, f"{peer.robot}: {said.reason or said.stance.value}", now_s)
+
+    def drop_void(self, robot: str) -> None:
+        """Forget everything about frames that are drawn no more; remember where the peer was, in case it is there still."""
+        others = [robot] if robot != self._ledger.robot else sorted(self.pairs)
+        for other in others:
+            if self._ledger.frame_of(other) is None:
+                continue
+            mine, old = self._ledger.mine.get(other), self.pair(other)
+            if mine is not None and self._ledger.is_current(mine.evidence):
+                continue
+            pair = self.pairs[other] = Pair(other, attempts=old.attempts)
+            if mine is None:
+                continue
+            peer = self._ledger.peers.get(other)
+            if mine.stance in (Stance.PROPOSE, Stance.ACK) and peer is not None and peer.boot == old.boot:
+                pair.hint = self._ledger.from_our_side(mine.evidence)
+            del self._ledger.mine[other]
+            self._ledger.seq += 1
+
+    def strike(self, peer: Peer, reason: str, now_s: float) -> None:
+        """Count an untruth; too many and the peer is no longer heard."""
+        options = self._ledger.options
+        if peer.trust.strike(reason, options.quarantine_strikes, options.quarantine_s, now_s):
+            self._ledger.note("quarantined", is_warning=True, peer=peer.robot, reason=reason)
+            self.withdraw(peer.robot, "quarantined", now_s)
+            self._ledger.judge_all(peer.robot, now_s)

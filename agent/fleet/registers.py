@@ -1,0 +1,49 @@
+"""What a query on our subtree is answered: everything we hold that others may pull."""
+
+from __future__ import annotations
+
+import re
+
+from agent.fleet.composition import Composition
+from agent.fleet.ledger import Ledger
+from agent.fleet.own_words import OwnWords
+from protocol.codec import encode
+
+_DIGEST = re.compile(r"-|[0-9a-f]{32}")
+
+
+class Registers:
+    """Answers by key, as `protocol.channels` lays them out."""
+
+    def __init__(self, ledger: Ledger, words: OwnWords, composition: Composition) -> None:
+        self._ledger, self._words, self._composition = ledger, words, composition
+
+    def answer(self, key: str) -> bytes | None:
+        """The encoded answer to a query on our subtree, at most 16 KB; None: there is no such register."""
+        own, blobs = self._ledger.own, self._ledger.own.blobs
+        match key.split("/"):
+            case ["hello"]:
+                return encode(self._words.hello())
+            case ["map", "feat"]:
+                return encode(own.announcement) if own.announcement else None
+            case ["map", "coarse"]:
+                coarse = own.coarse()
+                return blobs.answer(coarse) if coarse else None
+            case ["map", "fine", base, target] if _DIGEST.fullmatch(base) and _DIGEST.fullmatch(target):
+                return own.fine(_digest(base), _digest(target))
+            case ["edge", other]:
+                statement = self._ledger.mine.get(other)
+                return encode(statement) if statement else None
+            case ["edges"]:
+                return blobs.answer(self._words.statements())
+            case ["global", "meta"]:
+                return blobs.answer(self._composition.meta) if self._composition.meta else None
+            case ["global", "tiles", base, target] if _DIGEST.fullmatch(base) and _DIGEST.fullmatch(target):
+                return own.global_tiles(self._composition.history, _digest(base), _digest(target))
+            case ["blob", digest, index] if re.fullmatch(r"[0-9a-f]{64}", digest) and re.fullmatch(r"\d{1,5}", index):
+                return blobs.chunk(bytes.fromhex(digest), int(index))
+        return None
+
+
+def _digest(text: str) -> bytes:
+    return b"" if text == "-" else bytes.fromhex(text)
