@@ -13,7 +13,7 @@ STRIKES = {
     "equivocation": 3.0,  # two different statements under one number: nobody says that by accident
     "false proposal": 0.5,  # another transform on the very maps on which one was refused already
     "map turned false": 1.5,  # a map that fitted begins to contradict ours
-    "map broke its word": 0.25,  # its walls are elsewhere than they were; a particle filter that changes its mind does so, honestly
+    "map broke its word": 0.25,  # its walls moved; a particle filter that changes its mind does so, honestly
 }
 
 
