@@ -1,7 +1,9 @@
 """The occupancy grid itself: log-odds per cell, thresholds 0.7 and 0.3, unknown between (the paper, section II).
 
 One int8 a cell, 127 = log-odds 4: `cv2.add` saturates, which is the clamp that lets a map forget.  Each scan votes once
-per cell: -0.4 where a beam passed, +0.85 where one ended.  The grid grows by whole tiles.
+per cell: -0.4 where a beam passed, +0.85 where one ended.  One end makes a cell occupied only while nothing ever passed
+there: where a beam did, before or after, it takes ends from two scans. A walker's single trace is no wall, and a wall
+seen once is one.  The grid grows by whole tiles.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 TILE_CELLS = 64  # the grid grows, and reports changes, in squares of this side
 UNIT = 127 / 4.0  # cell values per unit of log-odds
-HIT = 27  # +0.85: one end point makes a new cell occupied
+HIT = 27  # +0.85: one end point makes a new cell occupied, and only just: a single pass takes it back
 PASS = -13  # -0.4: three beams in a row make a new cell free, five clear a walker's single trace
 NOTHING, PASSED, ENDED = 0, 1, 2
 BEFORE_END_M = 0.3  # a beam that crosses a wall this far before its end should not have

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
+from numpy.typing import NDArray
 
 from agent.mapping.log_odds import TILE_CELLS, LogOddsGrid
 from agent.mapping.motion import OdometryTrack
@@ -95,3 +98,45 @@ def test_small_changes_of_the_past_are_left_alone() -> None:
     drawing.add(points, np.zeros(3))
     drawing.follow(np.full((1, 3), 0.005))
     assert drawing.fresh is None
+
+
+def test_one_hit_is_a_wall_only_where_nothing_ever_passed() -> None:
+    """Where a beam passed, in whatever order, it takes hits from two keyframes; a wall seen once appears at once."""
+    for scans in [scans for n in range(2, 6) for scans in product((2.02, 3.02), repeat=n)]:
+        grid = LogOddsGrid(0.05)
+        for x_m in scans:
+            beam(grid, x_m)
+        hits, passes = scans.count(2.02), scans.count(3.02)
+        if hits < 2 and passes > 0:
+            assert cell(grid, 2.02) != OCCUPIED, scans
+        if passes == 0 or hits > 2 * passes:
+            assert cell(grid, 2.02) == OCCUPIED, scans
+
+
+def test_a_person_who_walks_through_the_room_is_not_on_the_map() -> None:
+    rng, grid = np.random.default_rng(0), LogOddsGrid(0.05)
+    walk = [SE2(x, 0.9 - 0.1 * x, 0.0) for x in np.arange(-3.5, 2.0, 0.35)]
+    for k, person in enumerate([*walk, None, None]):
+        legs = np.empty((0, 4)) if person is None else legs_at(person)
+        robot = SE2(-3.0 + 0.1 * k, -2.0, 0.3 * k)
+        points = scan_points(scan_at(np.vstack([ROOMS, legs]), robot, 5.0 * k, rng, beams=720), OdometryTrack(3.0, 6.0), OPTIONS)
+        grid.add((robot.x_m, robot.y_m), robot.apply(points.points_m), points.is_hit, clears=True)
+    drawn = grid.trinary()
+    occupied_m = drawn.points_of(np.argwhere(drawn.cells == OCCUPIED))
+    assert len(occupied_m) > 300
+    assert distance_to(ROOMS, occupied_m).max() < 0.12
+
+
+def legs_at(person: SE2) -> NDArray[np.float64]:
+    """A box of 0.3 m as four segments."""
+    x, y, r = person.x_m, person.y_m, 0.15
+    corners = np.array([[x - r, y - r], [x + r, y - r], [x + r, y + r], [x - r, y + r]])
+    return np.hstack([corners, np.roll(corners, -1, axis=0)])
+
+
+def distance_to(world: NDArray[np.float64], points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N,) metres from each point to the nearest segment."""
+    a, way = world[:, :2], world[:, 2:] - world[:, :2]
+    along = np.clip(((points_m[:, None] - a) * way).sum(axis=2) / (way**2).sum(axis=1), 0.0, 1.0)
+    nearest = a + along[..., None] * way
+    return np.asarray(np.hypot(*(points_m[:, None] - nearest).transpose(2, 0, 1)).min(axis=1))
