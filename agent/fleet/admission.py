@@ -39,6 +39,7 @@ class Admission:
         if moved is not None and moved.walls >= 40 and moved.wall_conflict_share > self._ledger.options.broken_word_share:
             self._pairs.words.strike(peer, "map broke its word", now_s)
             self._ledger.lay_out(now_s)
+            peer.refused, pair.is_urgent = peer.held.digest, is_neighbour
             return
         is_steady = moved is None or moved.wall_conflict_share <= self._ledger.options.max_self_conflict
         if not is_neighbour:
