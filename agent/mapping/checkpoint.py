@@ -15,6 +15,7 @@ import zlib
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agent.mapping.estimate import MapperStatus
 from agent.mapping.likelihood import AREA
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 MAGIC = b"MQMC"
 VERSION = 1
 LARGEST_BYTES = 1 << 30  # unpacked; a map of a square kilometre stays below
-DTYPES = {"bool", "uint8", "int8", "int32", "int64", "float32", "float64"}
+DTYPES = {"bool", "uint8", "uint16", "int8", "int32", "int64", "float32", "float64"}
 
 State = dict[str, Any]
 
@@ -122,9 +123,7 @@ def search_state(mapper: Mapper) -> State:
 def filter_state(mapper: Mapper) -> State:
     particles = mapper.map.filter
     fields = particles.fields
-    used, tables = np.unique(fields.tables, return_inverse=True)  # tiles are numbered anew; 0 stays 0
-    if used[0] != 0:
-        used, tables = np.append(0, used), tables + 1
+    used, tables = numbered_anew(fields.tables)
     return {
         "poses": particles.poses,
         "log_weights": particles.log_weights,
@@ -135,11 +134,20 @@ def filter_state(mapper: Mapper) -> State:
         "line": particles.line,
         "path_sizes": np.array([len(p) for p in particles.path], np.int64),
         "path": np.vstack([np.empty((0, 3)), *particles.path]),
-        "parents": np.concatenate([np.empty(0, np.uint8), *particles.parents]),
-        "tables": tables.reshape(fields.tables.shape).astype(np.int32),
+        "parents": np.concatenate([np.empty(0, np.uint16), *particles.parents]),
+        "tables": tables.astype(np.int32),
         "tiles": fields.pool[used],
         "fields.first_tile": fields.first_tile,
     }
+
+
+def numbered_anew(tables: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Tiles in use and the tables by their new numbers, in order of appearance: equal fields make equal bytes.  0 stays 0."""
+    tiles, first, inverse = np.unique(np.append(0, tables), return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    number = np.empty_like(order)
+    number[order] = np.arange(len(order))
+    return tiles[order], number[inverse[1:]].reshape(tables.shape)
 
 
 def drawing_state(drawing: Drawing) -> State:

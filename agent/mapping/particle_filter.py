@@ -7,10 +7,15 @@ of its proposal, and all particles are matched in the same few array operations.
                         refine every particle in its own field             (scan_matching.refine, batched)
                         draw from the refined mode, weigh by likelihood    (gain 0.03: beams are far from independent)
                         stamp the scan into every particle's field         (likelihood.py)
-                        resample when the effective number falls below half
+                        resample when the effective number falls below half, or when the spread asks for more
+
+There are as many particles as the robot's place is in doubt (the idea of Fox's KLD-sampling, 2003): twice the usual number
+after a long way through the unknown, a third of it where they stand on one spot.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +31,13 @@ PREDICTION_NOISE = np.array([0.01, 0.01, 0.004])  # metres, metres, radians: wha
 CLEARLY_LIKELIER = 1.0  # in log-weight: the drawn map should not flip between particles that are as good
 KEPT_KEYFRAMES = 4096  # particles agree on what lies further back than half of this
 RESAMPLE_BELOW = 0.5  # effective particles, as a share of all
+USUAL_SPREAD_M = 0.05  # one sigma of where the particles stand, above which more than the usual number are wanted
+SETTLED_M = 0.01  # ... and below which fewer will do; at 0.05, freiburg-079 was lost on two seeds of eight
+FEWEST, MOST = 1 / 3, 2.0  # of the usual number
+GROW_ABOVE = 1.5  # times as many wanted as there are: do not wait for the weights
+MOST_PARTICLES = 2000  # whatever was asked for
+
+Numbers = NDArray[np.uint16]
 
 
 class ParticleFilter:
@@ -33,12 +45,13 @@ class ParticleFilter:
 
     def __init__(self, particles: int, resolution_m: float, rng: np.random.Generator) -> None:
         self.rng = rng
+        self.usual_particles = particles
         self.fields = TiledFields(particles, resolution_m, FIELD_SIGMA_M)
         self.poses: Poses = np.zeros((particles, 3))  # T_map_robot of every particle
         self.log_weights = np.zeros(particles)
         self.path: list[Poses] = []  # poses at every keyframe so far
-        self.parents: list[NDArray[np.uint8]] = []  # particle i of keyframe k came from particle parents[k][i] of k - 1
-        self.next_parents = np.arange(particles, dtype=np.uint8)
+        self.parents: list[Numbers] = []  # particle i of keyframe k came from particle parents[k][i] of k - 1
+        self.next_parents: Numbers = np.arange(particles, dtype=np.uint16)
         self.followed = 0  # the particle that is tracked and drawn
         self.lineage: list[int] = []  # its ancestor at every keyframe ...
         self.line: Poses = np.empty((0, 3))  # ... and where that one was
@@ -110,17 +123,19 @@ class ParticleFilter:
     def _remember(self) -> None:
         self.path.append(self.poses.copy())
         self.parents.append(self.next_parents)
-        self.next_parents = np.arange(self.particles, dtype=np.uint8)
+        self.next_parents = np.arange(self.particles, dtype=np.uint16)
 
     def _resample_when_needed(self) -> None:
-        if self.effective_particles() >= RESAMPLE_BELOW * self.particles:
+        wanted = wanted_particles(self.poses, self.weights(), self.usual_particles)
+        is_uneven = self.effective_particles() < RESAMPLE_BELOW * self.particles
+        if not is_uneven and wanted < GROW_ABOVE * self.particles:
             return
-        ancestors = systematic(self.weights(), self.rng.random())
+        ancestors = systematic(self.weights(), self.rng.random(), wanted)
         self.followed = heir(ancestors, self.followed)
         self.poses = self.poses[ancestors]
         self.fields.resample(ancestors)
         self.log_weights = np.zeros(self.particles)
-        self.next_parents = ancestors.astype(np.uint8)
+        self.next_parents = ancestors.astype(np.uint16)
 
     def _follow(self) -> None:
         """Stay with the followed particle while none is clearly likelier, and keep its lineage."""
@@ -156,8 +171,16 @@ def heir(ancestors: NDArray[np.int64], particle: int) -> int:
     return min(int(np.searchsorted(ancestors, particle)), len(ancestors) - 1)
 
 
-def systematic(weights: NDArray[np.float64], offset: float) -> NDArray[np.int64]:
-    """Low-variance resampling: N evenly spaced pointers, one random offset in [0, 1)."""
-    n = len(weights)
+def wanted_particles(poses: Poses, weights: NDArray[np.float64], usual: int) -> int:
+    """How many particles their spread calls for; grows with its square root, so that neither limit comes soon."""
+    away_m = poses[:, :2] - weights @ poses[:, :2]
+    spread_m = float(np.sqrt(weights @ (away_m**2).sum(axis=1)))
+    more, fewer = math.sqrt(spread_m / USUAL_SPREAD_M), math.sqrt(spread_m / SETTLED_M)
+    share = max(min(fewer, 1.0), min(more, MOST), FEWEST)
+    return min(max(round(usual * share), 1), MOST_PARTICLES)
+
+
+def systematic(weights: NDArray[np.float64], offset: float, n: int) -> NDArray[np.int64]:
+    """Low-variance resampling: n evenly spaced pointers, one random offset in [0, 1)."""
     pointers = (np.arange(n) + offset) / n
-    return np.minimum(np.searchsorted(np.cumsum(weights), pointers), n - 1)
+    return np.minimum(np.searchsorted(np.cumsum(weights), pointers), len(weights) - 1)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agent.mapping.likelihood import AREA, TiledFields
 from agent.mapping.mapper import Mapper
 from agent.mapping.options import MappingOptions
-from agent.mapping.particle_filter import heir, systematic
+from agent.mapping.particle_filter import ParticleFilter, heir, systematic, wanted_particles
 from tests.agent.mapping.test_mapper import drive
 
 F32 = np.float32
@@ -54,8 +55,37 @@ def test_growing_tables_move_nothing() -> None:
 def test_systematic_resampling_gives_everyone_their_share() -> None:
     weights = np.array([0.1, 0.4, 0.05, 0.45])
     for offset in (0.0, 0.3, 0.99):
-        counts = np.bincount(systematic(np.repeat(weights / 25, 25), offset) // 25, minlength=4)
+        counts = np.bincount(systematic(np.repeat(weights / 25, 25), offset, 100) // 25, minlength=4)
         assert np.all(np.abs(counts - 100 * weights) <= 1)
+
+
+def apart(n: int, spread_m: float) -> NDArray[np.float64]:
+    """(n, 3) poses in two heaps, one sigma `spread_m` in all."""
+    poses = np.zeros((n, 3))
+    poses[: n // 2, 0], poses[n // 2 :, 0] = -spread_m, spread_m
+    return poses
+
+
+def test_the_number_of_particles_follows_their_spread() -> None:
+    even = np.full(30, 1.0 / 30)
+    wanted = [wanted_particles(apart(30, spread_m), even, 30) for spread_m in (0.0, 0.004, 0.01, 0.05, 0.1, 0.2, 5.0)]
+    assert wanted == [10, 19, 30, 30, 42, 60, 60]
+    assert wanted_particles(apart(1, 0.0), np.ones(1), 1) == 1
+
+
+def test_particles_far_apart_become_more_and_settled_ones_fewer() -> None:
+    wall = np.stack([np.linspace(-1, 1, 41), np.full(41, 1.0)], axis=1).astype(F32)
+    surfels = np.column_stack([wall, np.zeros(41), np.ones(41)]).astype(F32)
+    particles = ParticleFilter(12, 0.05, np.random.default_rng(0))
+    particles.start(wall)
+    particles.poses = apart(12, 0.5)
+    particles.update(np.zeros(3), (0.02, 0.01), surfels, wall)
+    assert particles.particles == 24 == particles.fields.particles == len(particles.next_parents)
+    particles.poses = np.zeros((24, 3))
+    particles.log_weights[1:] = -9.0
+    particles._resample_when_needed()
+    assert particles.particles == 4 == particles.fields.particles == len(particles.log_weights)
+    assert particles.followed == 0
 
 
 def test_the_followed_particle_lives_on_in_its_first_copy() -> None:
