@@ -221,7 +221,7 @@ class Show:
             known_m2=fused.known_area_m2(),
             conflicting_cells=best["global"]["conflicting_cells"] if best["global"] else 0,
             agreement=agreement(fused, truth, T_world_global) if truth is not None and T_world_global is not None else None,
-            pose_errors_m=self.pose_errors(T_world_global),
+            pose_errors_m=self.pose_errors(T_world_global, best["group"]),
             scans=self.scans()[0],
             scans_lost=self.scans()[1],
         )
@@ -242,15 +242,15 @@ class Show:
             if s["group"] and s["robot"] in s["frames"] and "pose" in s["mapping"]
         }
 
-    def pose_errors(self, T_world_global: SE2 | None) -> dict[str, float]:
-        """Where each robot believes to be in the fleet's map, against where it was at that very moment."""
+    def pose_errors(self, T_world_global: SE2 | None, group: Sequence[str]) -> dict[str, float]:
+        """Where each robot of the group believes to be in the fleet's map, against where it was at that very moment."""
         if T_world_global is None:
             return {}
         errors = {}
         poses = self.poses_global()
         for s in self.statuses:
             was = self.fleet.stage.pose_at(s["robot"], s["mapping"].get("pose_stamp_s", 0.0))
-            if was is not None and s["robot"] in poses:
+            if was is not None and s["robot"] in poses and s["robot"] in group:
                 errors[s["robot"]] = was.distance_m(T_world_global @ poses[s["robot"]])
         return errors
 

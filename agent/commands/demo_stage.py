@@ -25,6 +25,7 @@ from protocol.grid import OccupancyGrid
 REPLAY_SPEED = 8.0  # a recording of half an hour in a minute: scans come at about 9 Hz
 REPLAY_V_MAX_MPS = 50
 MERGE_WITHIN_S = 50.0
+START_SPACING_M = 4.5  # of way between neighbours: another room, and a corridor both will see
 SETTLE_S = 25.0  # after the last recorded scan, for the last and largest maps to be compared and to travel
 
 
@@ -85,7 +86,7 @@ class SimulatedStage:
 
     def __init__(self, world: World, n: int, seed: int, folder: Path, prefix: str) -> None:
         self._world = world
-        starts = world.start_poses(n, seed)
+        starts = world.start_poses(n, seed, START_SPACING_M)
         self._by_name = {f"{prefix}-{i + 1}": SimulatedRobot(world, starts[i], 64 * seed + i) for i in range(n)}
         self._lines = Lines(folder)
         self.robots = [self._actor(name, robot, 64 * seed + i) for i, (name, robot) in enumerate(self._by_name.items())]
