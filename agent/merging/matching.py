@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from agent.features.snapshot import MapSnapshot
+from agent.merging.grounds import weighed
+from agent.merging.mirror import is_mirror_image
 from agent.merging.paper import match_maps_like_the_paper
 from agent.merging.refinement import FINE_GATES_M, normal_equations, refined
-from agent.merging.result import Alternative, MatchOptions, MergeResult, Reason
+from agent.merging.result import Alternative, MatchOptions, MatchStatus, MergeResult, Reason
 from agent.merging.search import FIRST_PASS, SECOND_PASS, search
 from agent.merging.transforms import Poses, to_se2
-from agent.merging.validation import doubts, evidence, match_factor
-from agent.merging.verdict import Grounds, rival_score, verdict
-from agent.merging.views import side, witness
+from agent.merging.verdict import verdict
+from agent.merging.views import side
 from protocol.geometry import SE2
 
 _COVARIANCE_SCALE = 0.05**2 * 12.0  # measured: squared normalised errors have a trimmed mean of 0.8 a dimension
@@ -37,35 +40,30 @@ def match_maps(ours: MapSnapshot, theirs: MapSnapshot, options: MatchOptions | N
 
 
 def verify_match(ours: MapSnapshot, theirs: MapSnapshot, T_ours_theirs: SE2, options: MatchOptions | None = None) -> MergeResult:
-    """Judge one known transform again on the present maps: refine, then decide, without looking for rivals."""
+    """Judge one known transform again on the present maps: refine, then decide, without looking for rivals or reflections."""
     options = options or MatchOptions()
     if not len(ours.thin_walls) or not len(theirs.thin_walls):
         return MergeResult.none(Reason.EMPTY)
     T = ours.grid.origin.inverse() @ T_ours_theirs @ theirs.grid.origin
     pose = np.array([[T.x_m, T.y_m, T.theta_rad]])
-    return _judged(ours, theirs, refined(side(ours, _POINTS), side(theirs, _POINTS), pose, FINE_GATES_M), 1, options)
+    return _judged(
+        ours,
+        theirs,
+        refined(side(ours, _POINTS), side(theirs, _POINTS), pose, FINE_GATES_M),
+        1,
+        replace(options, mirror_test=False),
+    )
 
 
 def _judged(ours: MapSnapshot, theirs: MapSnapshot, poses: Poses, tried: int, options: MatchOptions) -> MergeResult:
     """The verdict on the best of the refined transforms."""
     if not len(poses):
         return MergeResult.none(Reason.NO_CANDIDATES)
-    found = evidence(witness(ours), witness(theirs), poses)
-    order = np.argsort(-found.score_m, kind="stable")
+    grounds, factor, overlap_m2, scores, order = weighed(ours, theirs, poses)
     best = int(order[0])
-    factor, overlap_m2 = match_factor(ours.working, theirs.working, poses[best])
-    grounds = Grounds(
-        float(found.score_m[best]),
-        rival_score(poses, found.score_m, best, theirs.middle_m),
-        float(found.agreeing_m[best]),
-        float(found.against_m[best]),
-        float(found.potential_m[best]),
-        float(found.observability_m[best]),
-        factor.value,
-        max(ours.working.resolution_m, theirs.working.resolution_m),
-        *doubts(witness(ours), witness(theirs), poses[best]),
-    )
     status, reason = verdict(grounds, options)
+    if status is MatchStatus.MERGED and options.mirror_test and is_mirror_image(ours, theirs, grounds):
+        status, reason = MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE
     return MergeResult(
         status,
         _map_frame(ours, theirs, poses[best]),
@@ -76,7 +74,7 @@ def _judged(ours: MapSnapshot, theirs: MapSnapshot, poses: Poses, tried: int, op
         grounds.rival,
         tried,
         reason,
-        tuple(Alternative(_map_frame(ours, theirs, poses[i]), float(found.score_m[i])) for i in order[1 : 1 + _ALTERNATIVES]),
+        tuple(Alternative(_map_frame(ours, theirs, poses[i]), float(scores[i])) for i in order[1 : 1 + _ALTERNATIVES]),
         grounds.numbers(),
     )
 

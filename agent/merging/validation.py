@@ -17,7 +17,6 @@ from agent.merging.scoring import (
     AGREES,
     CONFLICTS,
     CROSSES,
-    OPPOSITE,
     Probe,
     looked_up,
     outcome_table,
@@ -83,24 +82,25 @@ def _one_way(points: Witness, on: Witness, poses: Poses) -> tuple[NDArray[np.flo
 
 
 def doubts(ours: Witness, theirs: Witness, pose: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Signs of another place of the same kind, each per metre that agrees.
+    """Signs of another place of the same kind.
 
-    Attached wall that conflicts, straight wall deep in free space, and firm wall whose free side is the other one.
+    Attached wall that conflicts and straight wall deep in free space, per metre that agrees; then metres of agreeing wall
+    that is not long.
     """
-    attached, deep, opposite, agreeing = np.zeros(2), 0.0, 0.0, 0.0
+    attached, deep, distinct, agreeing = np.zeros(2), 0.0, 0.0, 0.0
     for points, on, T in ((theirs, ours, pose[None]), (ours, theirs, inverted(pose[None]))):
         outcome = OUTCOMES.take(readings(on.field.fine, on.field.resolution_m, points.probe, T))[0]
         clutter = points.kinds == ATTACHED
         attached += [np.count_nonzero(clutter & (outcome == what)) for what in (CONFLICTS, AGREES)]
-        firm = points.kinds != LOOSE
-        agreeing += np.count_nonzero(firm & (outcome == AGREES))
-        opposite += np.count_nonzero(firm & (outcome == OPPOSITE))
+        agrees = outcome == AGREES
+        agreeing += np.count_nonzero((points.kinds != LOOSE) & agrees)
+        distinct += np.count_nonzero(((points.kinds == ATTACHED) | (points.kinds == SHORT)) & agrees)
         alone = (points.kinds >= SHORT) & (outcome == CONFLICTS)
         x, y = placed(points.probe.xy1[:, alone], T, on.field.resolution_m)
         away = looked_up(on.field.distance_m, x, y, outside=0)
         deep += np.count_nonzero(away > DEEP_M)
     agreeing = max(agreeing, 0.5)
-    return float(attached[0] / max(attached[1], 0.5)), float(deep / agreeing), float(opposite / agreeing)
+    return float(attached[0] / max(attached[1], 0.5)), float(deep / agreeing), 0.5 * SPACING_M * float(distinct)
 
 
 def match_factor(ours: WorkingGrid, theirs: WorkingGrid, pose: NDArray[np.float64]) -> tuple[MatchFactor, float]:

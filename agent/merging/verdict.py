@@ -25,10 +25,10 @@ MIN_OBSERVABLE_SHARE = 0.1  # of agreeing wall: along a long corridor two metres
 MIN_AGREEING_M = 8.0
 USUAL_FACTOR = 0.95  # of true transforms at 10 cm
 FACTOR_SLOPE = 0.3  # coarser cells disagree more at the truth, by this a metre of cell
-MAX_SUSPICION = 1.0
+MAX_SUSPICION = 1.4  # true pairs of bent maps reach 1.6
 UNSUSPICIOUS = 0.5  # most true pairs lie below; above it more margin is asked for
 MARGIN_PER_SUSPICION_M = 5.0
-MAX_OPPOSITE_SHARE = 0.55  # thin walls seen from both sides make 0.1 to 0.5; a mirrored plan up to 1
+MIN_DISTINCT_M = 4.0  # two ends of a building share long walls; what tells them apart is short
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class Grounds:
     cell_m: float
     attached_doubt: float
     deep_doubt: float
-    opposite_share: float
+    distinct_m: float  # agreeing wall that is no long wall
 
     @property
     def suspicion(self) -> float:
@@ -76,7 +76,7 @@ def verdict(grounds: Grounds, options: MatchOptions) -> tuple[MatchStatus, str]:
     needed_m = options.min_margin_m + MARGIN_PER_SUSPICION_M * max(0.0, g.suspicion - UNSUSPICIOUS)
     if g.score - g.rival <= needed_m or g.rival >= MAX_RIVAL_SHARE * g.score:
         return MatchStatus.AMBIGUOUS, Reason.RIVAL
-    if g.suspicion > MAX_SUSPICION or g.opposite_share > MAX_OPPOSITE_SHARE:
+    if g.suspicion > MAX_SUSPICION or g.distinct_m < MIN_DISTINCT_M:
         return MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE
     return MatchStatus.MERGED, Reason.MATCHED
 

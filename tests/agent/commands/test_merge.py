@@ -28,7 +28,7 @@ def maps(tmp_path: Path) -> dict[str, Path]:
     grids = {
         "a": PLAN.mapped(T_A, 0.05, (-1, 0.6 * PLAN.width_m)),
         "b": OccupancyGrid(b.cells, b.resolution_m, far @ b.origin),
-        "c": PLAN.mapped(T_C, 0.06, (0.5 * PLAN.width_m, 1e3)),
+        "c": PLAN.mapped(T_C, 0.1, (0.5 * PLAN.width_m, 1e3)),
         "other": office(9).mapped(T_C, 0.05),
     }
     return {name: save_map(grid, tmp_path / name)[0] for name, grid in grids.items()}

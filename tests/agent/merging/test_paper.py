@@ -94,7 +94,7 @@ def test_taken_alone_the_match_factor_merges_different_buildings_and_the_guards_
 
 @pytest.mark.parametrize("seed", range(6))
 def test_guards_let_the_right_merge_pass(seed):
-    ours, theirs, truth = halves(office(seed), overlap=0.4, resolution_m=0.05)
+    ours, theirs, truth = halves(office(seed), overlap=0.4)
     result = guarded(ours, theirs)
     assert result.accepted
     assert error_m(result.T_ours_theirs, truth, theirs) < 0.05

@@ -20,7 +20,7 @@ GOOD = Grounds(
     cell_m=0.1,
     attached_doubt=0.05,
     deep_doubt=0.01,
-    opposite_share=0.1,
+    distinct_m=20.0,
 )
 
 
@@ -39,8 +39,8 @@ def test_good_grounds_merge() -> None:
         ({"observability_m": 4.0}, MatchStatus.AMBIGUOUS, Reason.UNOBSERVABLE),
         ({"rival": 35.0}, MatchStatus.AMBIGUOUS, Reason.RIVAL),
         ({"rival": 30.0}, MatchStatus.AMBIGUOUS, Reason.RIVAL),
-        ({"opposite_share": 0.8}, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
-        ({"factor": 0.90, "attached_doubt": 0.6, "deep_doubt": 0.05}, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
+        ({"distinct_m": 3.5}, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
+        ({"factor": 0.88, "attached_doubt": 0.6, "deep_doubt": 0.05}, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
     ],
 )
 def test_one_thing_missing_does_not(change: dict[str, float], status: MatchStatus, reason: str) -> None:
