@@ -28,6 +28,10 @@ def test_good_grounds_merge() -> None:
     assert verdict(GOOD, MatchOptions()) == (MatchStatus.MERGED, Reason.MATCHED)
 
 
+def test_long_walls_alone_merge_when_no_rival_comes_near() -> None:
+    assert verdict(replace(GOOD, distinct_m=3.5), MatchOptions()) == (MatchStatus.MERGED, Reason.MATCHED)
+
+
 @pytest.mark.parametrize(
     ("change", "status", "reason"),
     [
@@ -39,7 +43,7 @@ def test_good_grounds_merge() -> None:
         ({"observability_m": 4.0}, MatchStatus.AMBIGUOUS, Reason.UNOBSERVABLE),
         ({"rival": 35.0}, MatchStatus.AMBIGUOUS, Reason.RIVAL),
         ({"rival": 30.0}, MatchStatus.AMBIGUOUS, Reason.RIVAL),
-        ({"distinct_m": 3.5}, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
+        ({"distinct_m": 3.5, "score": 24.0}, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
         ({"factor": 0.88, "attached_doubt": 0.6, "deep_doubt": 0.05}, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
     ],
 )
