@@ -20,6 +20,7 @@ log = logging.getLogger(__name__)
 
 MAX_REQUEST_BYTES = 4096
 MAX_REPLY_BYTES = 8 * 1024 * 1024
+ACCEPT_AGAIN_S = 0.25
 CLIENT_TIMEOUT_S = 2.0  # a client that says nothing does not hold the next one up for longer
 
 Handler = Callable[[Mapping[str, Any]], Mapping[str, Any]]
@@ -27,16 +28,6 @@ Handler = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 
 class ControlError(Exception):
     """A running agent could not be asked, or refused."""
-
-
-def socket_folder() -> Path:
-    """Where agents of this user put their sockets."""
-    base = os.environ.get("RUNTIME_DIRECTORY") or os.environ.get("XDG_RUNTIME_DIR")
-    return Path(base.split(":")[0]) / "mapquilt" if base else Path(f"/tmp/mapquilt-{os.getuid()}")
-
-
-def socket_path(robot: str) -> Path:
-    return socket_folder() / f"{robot}.sock"
 
 
 class ControlServer:
@@ -89,8 +80,10 @@ class ControlServer:
                 client, _ = self._socket.accept()
             except TimeoutError:
                 continue
-            except OSError:
-                return
+            except OSError as error:  # no file handle is free: one may be, soon
+                log.debug("control: %s", error)
+                self._closed.wait(ACCEPT_AGAIN_S)
+                continue
             with client:
                 try:
                     client.settimeout(CLIENT_TIMEOUT_S)

@@ -56,15 +56,20 @@ class Keeper:
             self.locators = node.fleet.exchange.locators()
         self.links = node.fleet.exchange.links()
         self._watch_links()
-        checkpoint = self._checkpoints.take()
-        if checkpoint is not None and node.state is not None:
-            node.state.save("mapper", checkpoint)
+        self.save_checkpoint()
         if node.state is not None and time.monotonic() >= self._next_save_s:
             self._next_save_s = time.monotonic() + node.config.state.save_every_s
-            self._ask_for_checkpoint()
+            self.ask_for_checkpoint()
 
-    def _ask_for_checkpoint(self) -> None:
+    def ask_for_checkpoint(self) -> None:
+        """The map worker makes one between two scans; `save_checkpoint` puts it on disk."""
         self._node.map.call(lambda: self._checkpoints.put(self._node.map.mapper.checkpoint()))
+
+    def save_checkpoint(self) -> None:
+        """Save what the map worker made, if it did."""
+        checkpoint = self._checkpoints.take()
+        if checkpoint is not None and self._node.state is not None:
+            self._node.state.save("mapper", checkpoint)
 
     def save_now(self) -> None:
         """When stopping: the map worker has ended, so its mapper may be read here."""
@@ -131,7 +136,7 @@ class Keeper:
         node = self._node
         if node.state is None:
             raise ControlError("this agent keeps no state: it was started without a state directory")
-        self._ask_for_checkpoint()
+        self.ask_for_checkpoint()
         checkpoint = self._checkpoints.take(CHECKPOINT_WITHIN_S)
         if checkpoint is None:
             raise ControlError("the mapper did not answer in time; try again")

@@ -1,7 +1,7 @@
 """Every merge attempt is a record, accepted or not: kept for the page, and one JSON line each on disk.
 
 The file is appended to and flushed per line, so a crash loses at most the line being written; it is renamed once when it
-has grown large, so that it never fills a disk.
+has grown large, so that it never fills a disk.  Lines that a failing disk refused wait for the next one that it takes.
 """
 
 from __future__ import annotations
@@ -30,8 +30,10 @@ class Records:
         self._path = path
         self._lock = threading.Lock()
         self._kept: deque[dict[str, Any]] = deque(maxlen=KEPT)
+        self._unwritten: deque[str] = deque(maxlen=KEPT)
         self._since_s = time.monotonic()
         self.counts: dict[str, int] = {}
+        self.last_error = ""  # why the newest lines are not on disk
 
     def add(self, note: Note) -> None:
         record = {
@@ -56,15 +58,25 @@ class Records:
     def _write(self, record: dict[str, Any]) -> None:
         if self._path is None:
             return
+        self._unwritten.append(json.dumps(record) + "\n")
         try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            if self._path.exists() and self._path.stat().st_size > MAX_FILE_BYTES:
-                self._path.replace(self._path.with_suffix(".old.jsonl"))
-            with self._path.open("a") as file:
-                file.write(json.dumps(record) + "\n")
+            self._append(self._path, "".join(self._unwritten))
         except OSError as error:
-            log.warning("records: cannot write %s: %s; goes on without", self._path, error)
-            self._path = None
+            if not self.last_error:
+                log.warning("records: cannot write %s: %s; kept in memory until it can", self._path, error)
+            self.last_error = str(error)
+            return
+        if self.last_error:
+            log.info("records: writing works again in %s", self._path)
+        self.last_error = ""
+        self._unwritten.clear()
+
+    def _append(self, path: Path, lines: str) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.exists() and path.stat().st_size > MAX_FILE_BYTES:
+            path.replace(path.with_suffix(".old.jsonl"))
+        with path.open("a") as file:
+            file.write("\n" * bool(self.last_error) + lines)  # the try before may have left half a line
 
 
 def plain(value: Any) -> Any:

@@ -44,6 +44,7 @@ def snapshot(node: Node) -> dict[str, Any]:
         "frames": frames,
         "covariances": {robot: list(frame.covariance) for robot, frame in fleet.frames.items()},
         "poses": poses(node, fleet),
+        "odometry": odometry(node),
         "peers": peers(fleet),
         "edges": [
             {"a": e.robot_a, "b": e.robot_b, "match_factor": round(e.match_factor, 4), "T_a_b": plain_pose(e.T_a_b)}
@@ -133,6 +134,15 @@ def poses(node: Node, fleet: FleetState) -> dict[str, list[float]]:
     return found
 
 
+def odometry(node: Node) -> dict[str, list[float]] | None:
+    """Where the wheels say we are, and what the map makes of it; None without wheels."""
+    estimate, newest = node.map.newest, node.readings.newest_odometry
+    if estimate is None or newest is None:
+        return None
+    T_odom_robot = SE2(newest.x_m, newest.y_m, newest.theta_rad)
+    return {"T_map_odom": plain_pose(estimate.T_map_odom), "T_odom_robot": plain_pose(T_odom_robot)}
+
+
 def peers(fleet: FleetState) -> list[dict[str, Any]]:
     return [
         {
@@ -208,5 +218,7 @@ def problems(node: Node, fleet: FleetState) -> list[str]:
     said += [f"worker {name} makes no progress" for name in node.health.stuck]
     said += [f"worker {r.name} fails: {r.last_error}; please report this with the log" for r in node.reports() if r.is_failing]
     if node.state is not None and node.state.last_error:
-        said.append(f"the map cannot be saved: {node.state.last_error}")
+        said.append(f"state: {node.state.last_error}; mapping goes on in memory")
+    if node.records.last_error:
+        said.append(f"records cannot be written: {node.records.last_error}; the newest are kept in memory")
     return said

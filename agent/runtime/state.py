@@ -3,8 +3,8 @@
     magic "mqst" | version u16 | length u64 | sha256 (32) | payload          <name>.<generation>.state
 
 A value is written aside, flushed, renamed into place, and the directory is flushed; the older generation is deleted only
-then.  A file that does not read as written is set aside as `*.bad` and the generation before it is used: state never
-keeps a robot from starting.
+then.  A file that does not read as written is set aside as `*.bad` and the generation before it is used; one that cannot
+be read at all, which may be the disk's fault, stays where it is.  State never keeps a robot from starting.
 """
 
 from __future__ import annotations
@@ -15,9 +15,12 @@ import logging
 import os
 import re
 import struct
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 log = logging.getLogger(__name__)
+T = TypeVar("T")
 
 HEADER = struct.Struct("<4sHQ32s")
 MAGIC = b"mqst"
@@ -27,7 +30,7 @@ MAX_BYTES = 512 * 1024 * 1024
 
 
 class StateDirectory:
-    """One directory of one robot.  A disk that fails makes `save` return False, never raise: mapping goes on in memory."""
+    """One directory of one robot.  A disk that fails is told in `last_error`, never raised: mapping goes on in memory."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -42,35 +45,43 @@ class StateDirectory:
             for _, path in generations[KEPT - 1 :]:
                 path.unlink(missing_ok=True)
         except OSError as error:
-            if not self.last_error:
-                log.warning("state: cannot save %s in %s: %s; goes on in memory", name, self.folder, error)
-            self.last_error = str(error)
+            self._failed(f"cannot save {name} in {self.folder}: {error}")
             return False
         if self.last_error:
-            log.info("state: saving works again in %s", self.folder)
+            log.info("state: the disk works again in %s", self.folder)
         self.last_error = ""
         return True
 
     def load(self, name: str) -> bytes | None:
         """The newest generation that reads as written; None when there is none."""
         try:
-            generations = self._generations(name)
-        except OSError:
+            generations = _stubbornly(lambda: self._generations(name))
+        except OSError as error:
+            self._failed(f"cannot look into {self.folder}: {error}")
             return None
         for _, path in generations:
             try:
-                return unpack(path.read_bytes())
-            except (OSError, CorruptState) as error:
+                return unpack(_stubbornly(path.read_bytes))
+            except OSError as error:
+                self._failed(f"cannot read {path}: {error}")
+            except CorruptState as error:
                 log.warning("state: %s is set aside: %s", path, error)
                 with contextlib.suppress(OSError):
                     path.replace(path.with_suffix(".bad"))
         return None
 
+    def _failed(self, what: str) -> None:
+        if not self.last_error:
+            log.warning("state: %s; goes on in memory", what)
+        self.last_error = what
+
     def forget(self, name: str) -> None:
         """Delete every generation of a name."""
-        with contextlib.suppress(OSError):
-            for _, path in self._generations(name):
+        try:
+            for _, path in _stubbornly(lambda: self._generations(name)):
                 path.unlink(missing_ok=True)
+        except OSError as error:
+            self._failed(f"cannot delete {name} in {self.folder}: {error}")
 
     def _generations(self, name: str) -> list[tuple[int, Path]]:
         """(number, file), newest first."""
@@ -92,6 +103,14 @@ class StateDirectory:
             os.fsync(directory)
         finally:
             os.close(directory)
+
+
+def _stubbornly(action: Callable[[], T]) -> T:
+    """A second try before a map is given up: no file handle was free, or a cable shook."""
+    try:
+        return action()
+    except OSError:
+        return action()
 
 
 class CorruptState(Exception):

@@ -1,0 +1,100 @@
+"""All that a robot does with its disk, as a script: sixty seconds of its life, without threads and without waiting.
+
+It finds its map of the last run, maps on, saves now and then, writes records, rotates their file, forgets its map when told
+to, and saves a last time.  Whatever the disk does meanwhile must be said in `problems`, and be over when the disk is well.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+
+from agent.commands.report import RECORD_FILES, read_records
+from agent.config import Config, LidarConfig, MappingConfig, RobotConfig
+from agent.fleet.effects import Note
+from agent.runtime import records, snapshot
+from agent.runtime.node import Node
+from agent.runtime.state import StateDirectory
+from hw.readings import LaserScan
+from tests.harness.failing_disk import FailingDisk
+
+SECONDS, SAVE_EVERY_S, RESET_AT_S = 60, 5, 32
+CONFIG = Config(RobotConfig("r1"), LidarConfig("sim:office?seed=3"), mapping=MappingConfig(particles=1, resolution_m=0.2))
+
+
+def scan(number: int) -> LaserScan:
+    """A square room of four metres, seen from its middle."""
+    angles = np.linspace(-np.pi, np.pi, 90, endpoint=False, dtype=np.float32)
+    ranges = 2.0 / np.maximum(np.abs(np.cos(angles)), np.abs(np.sin(angles)))
+    return LaserScan(1.0 + number, ranges.astype(np.float32), angles, 0.05, 10.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Life:
+    """How the minute went: what was not as it should be, and the map that was saved last."""
+
+    wrong: list[str]
+    saved: bytes
+
+
+def live(folder: Path, disk: FailingDisk, heal_at_s: int = SECONDS, before: Life | None = None) -> Life:
+    """A minute, after another one in the same place or as the first."""
+    with mock.patch.object(records, "MAX_FILE_BYTES", 2000):
+        node = Node(CONFIG, folder, None)
+        node.map.publish()
+        wrong = []
+        if before is not None and node.map.mapper.checkpoint() != before.saved and not problems(node):
+            wrong.append("the map of the last run is gone, and nothing is said")
+        for second in range(SECONDS):
+            if second == heal_at_s:
+                disk.heal()
+            wrong += _second(node, second, disk)
+        disk.heal()
+        node.records.add(Note("merge-attempt", {"peer": "r2", "number": SECONDS}))
+        saved = _map_and_save(node, SECONDS)
+    wrong += [f"the disk is well, and still: {problem}" for problem in problems(node)]
+    return Life(wrong + _left_behind(folder, saved), saved)
+
+
+def _second(node: Node, second: int, disk: FailingDisk) -> list[str]:
+    failures = disk.failures
+    node.records.add(Note("merge-attempt", {"peer": "r2", "number": second}))
+    is_said = bool(problems(node))
+    if second % SAVE_EVERY_S == 0:
+        _map_and_save(node, second)
+    if second == RESET_AT_S:
+        node.reset_map()
+    if disk.failures > failures and not (is_said or problems(node)):
+        return [f"second {second}: {disk.failed[-1]} failed, and nothing is said"]
+    return []
+
+
+def _map_and_save(node: Node, second: int) -> bytes:
+    saved = node.map.mapper.checkpoint()
+    node.readings.put(scan(second))
+    node.keeper.ask_for_checkpoint()
+    node.map.step()
+    node.keeper.save_checkpoint()
+    return saved
+
+
+def problems(node: Node) -> list[str]:
+    """What the robot says of its disk."""
+    said = snapshot.problems(node, node.fleet.state())
+    return [problem for problem in said if problem.startswith(("state", "records"))]
+
+
+def _left_behind(folder: Path, saved: bytes) -> list[str]:
+    """The map that was saved last is there, no sound file was set aside, and no record is missing."""
+    wrong = []
+    if StateDirectory(folder).load("mapper") != saved:
+        wrong.append("the map that was saved last is not on disk")
+    if list(folder.glob("*.bad")):
+        wrong.append("a sound file was set aside")
+    numbers = sorted({record["number"] for name in RECORD_FILES for record in read_records(folder / name)})
+    if numbers != list(range(numbers[0], SECONDS + 1)):
+        wrong.append(f"records are missing: {numbers}")
+    return wrong
