@@ -19,7 +19,7 @@ from protocol.channels import MAX_PUSH_BYTES
 from protocol.codec import encode
 from protocol.geometry import SE2, wrap_angle
 from protocol.grid import OccupancyGrid
-from protocol.messages import GlobalMap, GlobalMember, GlobalMeta, GlobalTiles, MapVersion
+from protocol.messages import NO_DIGEST, GlobalMap, GlobalMember, GlobalMeta, GlobalTiles, MapVersion
 from protocol.tiles import TileMap
 
 _KEPT_GLOBAL_MAPS = 6
@@ -48,6 +48,10 @@ class _Recipe:
     members: tuple[GlobalMember, ...]
     edges: tuple[bytes, ...]
     followed: GlobalMeta | None  # None: our own
+
+    def inputs(self) -> tuple[object, ...]:
+        """All that decides the cells."""
+        return self.resolution_m, [(m.robot, m.map.frame, m.map.digest, m.T_global_map) for m in self.members]
 
 
 class Composition:
@@ -106,9 +110,7 @@ class Composition:
         if fused is None or self._ledger.group is None:
             return
         tiles = TileMap.of(fused.grid)
-        if recipe.followed is None:
-            self._publish(recipe, tiles, fused)
-        elif tiles.digest != recipe.followed.digest:
+        if recipe.followed is not None and tiles.digest != recipe.followed.digest:
             self._ledger.note("global-map-differs", is_warning=True, composer=recipe.followed.robot)
         self._adopt(recipe, tiles, fused.conflicting_cells, fused.agreeing_cells)
 
@@ -141,14 +143,21 @@ class Composition:
         return root
 
     def _metas_of(self, group: Group) -> list[GlobalMeta]:
-        """Recipes that members of the group published and still hold."""
+        """Recipes that members of the group published, of maps that some member still holds."""
         peers = [self._ledger.peers[robot] for robot in sorted(group.T_root) if robot in self._ledger.peers]
-        return [p.meta for p in peers if p.meta is not None and p.beat is not None and p.beat.global_digest == p.meta.id()]
+        held = {peer.beat.global_digest for peer in peers if peer.beat is not None}
+        return [peer.meta for peer in peers if peer.meta is not None and peer.meta.id() in held]
 
     def awaits_meta(self, robot: str) -> bool:
-        """Whether a peer of our group holds a global map whose frame we should know before we make our own."""
-        group = self._ledger.group
-        return self.global_map is None and group is not None and robot in group.T_root
+        """Whether a peer of our group holds a global map whose frame we should know before we make our own.
+
+        What the composer, or anybody who holds the same map, told us of it is enough.
+        """
+        group, peer = self._ledger.group, self._ledger.peers.get(robot)
+        if self.global_map is not None or group is None or robot not in group.T_root or peer is None or peer.beat is None:
+            return False
+        told = {other.meta.id() for other in self._ledger.peers.values() if other.meta is not None}
+        return peer.beat.global_digest not in told | {NO_DIGEST}
 
     # Composing.
 
@@ -176,9 +185,8 @@ class Composition:
             return False
         if self._grouped_s is None:
             self._grouped_s = now_s
-        peers = [self._ledger.peers[robot] for robot in group.T_root if robot in self._ledger.peers]
-        is_told = all(p.meta is not None or p.beat is None or not p.beat.global_digest for p in peers)
-        return not is_told and now_s - self._grouped_s < _RECIPE_WAIT_S
+        holds_any = any(self.awaits_meta(robot) for robot in group.T_root)
+        return holds_any and not self._metas_of(group) and now_s - self._grouped_s < _RECIPE_WAIT_S
 
     def _recipe(self, group: Group, versions: dict[str, MapVersion]) -> _Recipe | None:
         """The group's layout with these versions; None while there are fewer than two whose cells are here."""
@@ -202,7 +210,8 @@ class Composition:
         resolution_m = min(tiles.resolution_m for tiles in grids if tiles is not None)
         return _Recipe(root, resolution_m, members, tuple(sorted(edge.id for edge in group.edges)), None)
 
-    def _publish(self, recipe: _Recipe, tiles: TileMap, fused: Fused) -> None:
+    def _publish(self, recipe: _Recipe, digest: bytes, conflicting_cells: int, agreeing_cells: int) -> None:
+        """Hand the recipe of the map we hold to whoever asks, even one we followed: its author may be gone.  Composers push it."""
         self._seq += 1
         ledger = self._ledger
         self.meta = GlobalMeta(
@@ -213,9 +222,9 @@ class Composition:
             recipe.resolution_m,
             recipe.members,
             recipe.edges,
-            tiles.digest,
-            fused.conflicting_cells,
-            fused.agreeing_cells,
+            digest,
+            conflicting_cells,
+            agreeing_cells,
         )
         if self.composer == ledger.robot and len(encode(self.meta)) <= MAX_PUSH_BYTES:
             ledger.send(self.meta)
@@ -263,6 +272,11 @@ class Composition:
     # Both.
 
     def _fuse(self, recipe: _Recipe, now_s: float) -> None:
+        """Have the recipe's maps laid over one another; when only words about them changed, the map we hold is that map."""
+        held, tiles = self.global_map, self.history.newest
+        if held is not None and tiles is not None and self._made is not None and self._made.inputs() == recipe.inputs():
+            self._adopt(recipe, tiles, held.conflicting_cells, held.agreeing_cells)
+            return
         maps = []
         for member in recipe.members:
             grid = self._grid(member.robot, member.map.digest)
@@ -275,6 +289,7 @@ class Composition:
     def _adopt(self, recipe: _Recipe, tiles: TileMap, conflicting_cells: int, agreeing_cells: int) -> None:
         self.history.add(tiles)
         self._made, self.root = recipe, recipe.root
+        self._publish(recipe, tiles.digest, conflicting_cells, agreeing_cells)
         author = recipe.followed.robot if recipe.followed else self._ledger.robot
         self.global_map = GlobalMap(
             author, recipe.root, tiles.digest, recipe.members, tiles.grid(), conflicting_cells, agreeing_cells

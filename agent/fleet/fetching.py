@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from agent.fleet.effects import Fetch
 from agent.fleet.ledger import Ledger
 
-_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 8.0
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 3.0  # a question costs 200 B; who is lost is not asked at all
 BULK = frozenset({"coarse", "fine", "tiles"})
 
 
@@ -53,15 +53,20 @@ class Fetching:
             return None
         del self._running[name]
         if is_good:
-            self.forget(fetch.peer)  # it answers again
+            self._forgive(fetch.peer)  # it answers again
         else:
             patience = self._patience.setdefault(name, _Patience())
             patience.failures += 1
             patience.not_before_s = now_s + min(_FIRST_PAUSE_S * 2.0**patience.failures, _LONGEST_PAUSE_S)
         return name[1]
 
-    def forget(self, peer: str) -> None:
-        """A peer that came back is asked at once."""
+    def begin_anew(self, peer: str) -> None:
+        """A peer that came back is asked at once, whatever went unanswered before."""
+        self._forgive(peer)
+        for name in [name for name in self._running if name[0] == peer]:
+            del self._running[name]
+
+    def _forgive(self, peer: str) -> None:
         for name in [name for name in self._patience if name[0] == peer]:
             del self._patience[name]
 

@@ -49,7 +49,7 @@ class Inbox:
             case Statement():
                 self._on_statement(peer, message, now_s)
             case GlobalMeta() if peer.meta is None or message.seq > peer.meta.seq:
-                peer.meta = message
+                peer.meta, peer.meta_s = message, now_s
             case _:
                 pass
 
@@ -61,7 +61,7 @@ class Inbox:
             case Statements():
                 self._on_statements(peer, message, now_s)
             case GlobalMeta() if peer.meta is None or message.seq >= peer.meta.seq:
-                peer.meta = message
+                peer.meta, peer.meta_s = message, now_s
             case CoarseMap():
                 peer.coarse = message
             case FineTiles():
@@ -76,7 +76,7 @@ class Inbox:
         if not self._ledger.roster.accept_beat(peer, beat, now_s):
             return
         if peer.presence is not Presence.ALIVE:
-            self._fetching.forget(peer.robot)
+            self._fetching.begin_anew(peer.robot)
         self._check_frame(peer, before, now_s)
 
     def _on_announcement(self, peer: Peer, said: MapAnnouncement, now_s: float) -> None:
@@ -153,7 +153,7 @@ class Inbox:
         for robot in roster.restarted:
             self._ledger.note("peer-restarted", peer=robot)
             self._pairs.words.drop_void(robot)
-            self._fetching.forget(robot)
+            self._fetching.begin_anew(robot)
             self._ledger.judge_all(robot, now_s)
             for other in self._ledger.peers:
                 self._ledger.judge_pair(robot, other, now_s)

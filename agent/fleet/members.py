@@ -38,6 +38,7 @@ class Peer:
     announcement: MapAnnouncement | None = None
     coarse: CoarseMap | None = None
     meta: GlobalMeta | None = None
+    meta_s: float = -1e18  # when it was heard; older beats may speak of an earlier one
     statements: dict[str, Statement] = field(default_factory=dict)
     statements_seq: int = 0
     statements_digest: bytes | None = None  # over `statements`; None: they changed since

@@ -35,7 +35,7 @@ class Pulling:
             self._fetching.want(peer.robot, "edges", "edges", now_s)
         meta_id = peer.meta.id() if peer.meta else NO_DIGEST
         is_wanted = peer.robot == self._composition.composer or self._composition.awaits_meta(peer.robot)
-        if is_wanted and beat.global_digest not in (NO_DIGEST, meta_id):
+        if is_wanted and peer.beat_s >= peer.meta_s and beat.global_digest not in (NO_DIGEST, meta_id):
             self._fetching.want(peer.robot, "global", "global/meta", now_s)
 
     def pull_maps(self, turn: list[Peer], now_s: float) -> None:

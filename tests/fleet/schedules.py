@@ -47,7 +47,12 @@ class Schedule:
         self.world = random_world(seed % 50, SIDE_M, CELL_M)
         self.fleet = Fleet(seed, link=Link(loss=rng.choice((0.0, 0.0, 0.05, 0.2))))
         self.options = FleetOptions(
-            retry_period_s=1.0, reverify_period_s=1.0, announce_period_s=1.0, compose_period_s=1.0, fetch_timeout_s=6.0
+            retry_period_s=1.0,
+            retry_change_s=2.0,
+            reverify_period_s=1.0,
+            announce_period_s=1.0,
+            compose_period_s=1.0,
+            fetch_timeout_s=8.0,
         )
         for i in range(self.outcome.robots):
             self.fleet.add(f"r{i}", self._explorer(), self.options)

@@ -281,16 +281,26 @@ class Fleet:
         self.carry_out(node, node.coordinator.on_message(message, self.local_s(node)))
 
     def _fetch(self, node: Node, fetch: Fetch) -> None:
-        life, delay_s = node.life, 2 * self.rng.uniform(*self.link.delay_s)
+        """As the runtime does: a silent question is asked again after 1.5 s, and given up after 6 s."""
+        life, is_over = node.life, False
 
-        def answer() -> None:
-            if node.life != life or node.coordinator is None:
+        def ask(times: int) -> None:
+            if is_over or times > 4:
+                end(None)
                 return
-            message = self._pull(node, fetch)
-            self.carry_out(node, node.coordinator.on_fetched(fetch, message, self.local_s(node)))
+            if self.rng.random() >= self.link.loss:
+                self.at(2 * self.rng.uniform(*self.link.delay_s), lambda: end(self._pull(node, fetch), is_last=times == 4))
+            self.at(1.5, lambda: ask(times + 1))
 
-        is_lost = self.rng.random() < self.link.loss
-        self.at(delay_s if not is_lost else 2.0, (lambda: None) if is_lost and self.rng.random() < 0.1 else answer)
+        def end(message: Message | None, *, is_last: bool = True) -> None:
+            nonlocal is_over
+            if is_over or (message is None and not is_last):
+                return
+            is_over = True
+            if node.life == life and node.coordinator is not None:
+                self.carry_out(node, node.coordinator.on_fetched(fetch, message, self.local_s(node)))
+
+        ask(1)
 
     def _pull(self, node: Node, fetch: Fetch) -> Message | None:
         reached = [peer for peer in self.processes(fetch.peer) if self.connects(node.name, peer.name)]
