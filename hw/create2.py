@@ -16,16 +16,26 @@ from hw.odometry import TickSample, WheelGeometry
 HEADER = b"\x13"
 START, SAFE, STREAM, PAUSE_STREAM = 128, 131, 148, 150
 BUMPS, LEFT_ENCODER, RIGHT_ENCODER = 7, 43, 44
-SIZES = {7: 1, 13: 1, 19: 2, 20: 2, 22: 2, 25: 2, 26: 2, 29: 2, 35: 1, 43: 2, 44: 2, 58: 1}  # bytes of the packets we know
+_WORDS = (19, 20, 22, 23, *range(25, 32), 33, *range(39, 45), *range(46, 52), *range(54, 58))
+SIZES = {packet: 2 if packet in _WORDS else 1 for packet in range(7, 59)}  # bytes of each sensor packet
+_SPANS = {0: (7, 26), 1: (7, 16), 2: (17, 20), 3: (21, 26), 4: (27, 34), 5: (35, 42), 6: (7, 42)}
+_SPANS |= {100: (7, 58), 101: (43, 58), 106: (46, 51), 107: (54, 58)}
+GROUPS = {group: tuple(range(first, last + 1)) for group, (first, last) in _SPANS.items()}
 MOST_BYTES = 170  # what fits a slot of 15 ms at 115200 baud
 METRES_PER_TICK = 0.072 * 3.141592653589793 / 508.8
 TRACK_M = 0.235
 MAX_SPEED_MPS = 0.5
 
 
+def encode_value(packet: int, value: int) -> bytes:
+    """The bytes of one sensor packet; counters wrap, negative values are two's complement."""
+    bits = 8 * SIZES[packet]
+    return (value % (1 << bits)).to_bytes(SIZES[packet], "big")
+
+
 def encode_stream(values: Mapping[int, int]) -> bytes:
     """A stream frame with these packets, in their order."""
-    body = b"".join(bytes((packet,)) + value.to_bytes(SIZES[packet], "big") for packet, value in values.items())
+    body = b"".join(bytes((packet,)) + encode_value(packet, value) for packet, value in values.items())
     frame = HEADER + bytes((len(body),)) + body
     return frame + bytes((-sum(frame) & 0xFF,))
 

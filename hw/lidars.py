@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from hw import scip
 from hw.driver import Driver
 from hw.hokuyo import Hokuyo
 from hw.ld06 import MODELS as LDROBOT_MODELS
@@ -43,8 +44,11 @@ def _ydlidar(url: DeviceUrl) -> Driver:
 
 
 def _hokuyo(url: DeviceUrl) -> Driver:
-    url.only((*COMMON, "intensity", "free"))
-    return _limited(Hokuyo(url.integer("intensity", 0, 0, 1) == 1, url.integer("free", 0, 0, 1) == 1), url)
+    url.only((*COMMON, "mode", "intensity", "free", "rate"))
+    usual = "me" if url.integer("intensity", 0, 0, 1) else "md"
+    mode = url.text_of("mode", usual, [mode.lower() for mode in scip.MODES]).upper()
+    rate = int(url.text_of("rate", "115200", map(str, scip.RATES)))
+    return _limited(Hokuyo(mode, url.integer("free", 0, 0, 1) == 1, rate), url)
 
 
 def _sick(url: DeviceUrl) -> Driver:

@@ -127,6 +127,7 @@ class SickLms(DriverBase):
         self._answers: dict[int, bytes] = {}
         self._last_scan_s: float | None = None
         self._suspect_scans = 0
+        self._is_ack_due = False
 
     def limit(self, range_min_m: float, range_max_m: float) -> None:
         """Believe only ranges within these limits."""
@@ -162,11 +163,15 @@ class SickLms(DriverBase):
 
     def _ask(self, payload: bytes, answer: int, timeout_s: float) -> Ask:
         self._answers.pop(answer, None)
+        self._is_ack_due = True
         return Ask(encode(payload), lambda: self._answers.get(answer), timeout_s)
 
     def feed(self, data: bytes, now_s: float) -> list[Reading]:
         """Scans that these bytes complete; answers are kept for the script."""
         self._window.push(data)
+        if self._is_ack_due and self._window.data[:1] in (bytes((ACK,)), bytes((NAK,))):
+            self._window.take(1)  # stands before each answer, outside of its telegram
+            self._is_ack_due = False
         frames = self._finder.take(self._window, self.counters)
         readings: list[Reading] = []
         for row, behind, gap in zip(frames.data, frames.behind.tolist(), frames.gap.tolist(), strict=True):

@@ -1,4 +1,4 @@
-"""Simulated wheel bases: Create 2, Kobuki, ros_arduino_bridge and RoboClaw, with the encoders of whatever turns their wheels.
+"""Simulated wheel bases, with the encoders of whatever turns their wheels: Kobuki, ros_arduino_bridge, RoboClaw.
 
 Each takes its counters from a `Counting`, which can also fail: restart at zero, or jump.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import struct
 from typing import Protocol
 
-from hw import arduino_bridge, create2, kobuki, roboclaw, wheels
+from hw import arduino_bridge, kobuki, roboclaw, wheels
 from hw.sim.devices import LATE_S
 
 
@@ -53,7 +53,7 @@ class Wt1Ticks(Counting):
         self.info = info
 
 
-class _Streaming:
+class Streaming:
     """A frame every `period_s`."""
 
     def __init__(self, counting: Counting, period_s: float) -> None:
@@ -64,7 +64,8 @@ class _Streaming:
         """See `Counting.fault`."""
         self.counting.fault(kind, value, now_s)
 
-    def _times(self, now_s: float) -> list[float]:
+    def times(self, now_s: float) -> list[float]:
+        """Moments of the frames that are due."""
         if self._next_s is None or now_s - self._next_s > LATE_S:
             self._next_s = now_s
         times = []
@@ -74,60 +75,7 @@ class _Streaming:
         return times
 
 
-class Create2Sim(_Streaming):
-    """Answers 149 (query), 148 (stream) and 150 (pause); starts in the off mode, as after power-up."""
-
-    baud = 115200
-
-    def __init__(self, counting: Counting) -> None:
-        super().__init__(counting, 0.015)
-        self._inbox, self._outbox = bytearray(), bytearray()
-        self._packets: list[int] = []
-        self._is_streaming = False
-
-    def receive(self, data: bytes, now_s: float) -> None:
-        """See `ByteDevice`."""
-        self._inbox += data
-        while self._inbox:
-            size = self._size()
-            if len(self._inbox) < size:
-                return
-            command = bytes(self._inbox[:size])
-            del self._inbox[:size]
-            self._obey(command, now_s)
-
-    def _size(self) -> int:
-        code = self._inbox[0]
-        if code in (148, 149):
-            return 2 + self._inbox[1] if len(self._inbox) > 1 else 2
-        return {142: 2, 150: 2, 137: 5, 145: 5}.get(code, 1)
-
-    def _obey(self, command: bytes, now_s: float) -> None:
-        if command[0] == create2.STREAM:
-            self._packets, self._is_streaming = [p for p in command[2:] if p in create2.SIZES], True
-        elif command[0] == create2.PAUSE_STREAM:
-            self._is_streaming = command[1] == 1
-        elif command[0] in (142, 149):
-            wanted = command[1:2] if command[0] == 142 else command[2:]
-            values = self._values(now_s, [p for p in wanted if p in create2.SIZES])
-            self._outbox += b"".join(v.to_bytes(create2.SIZES[p], "big") for p, v in values.items())
-
-    def _values(self, time_s: float, packets: list[int]) -> dict[int, int]:
-        left, right = self.counting.at(time_s)
-        known = {create2.LEFT_ENCODER: left % 65536, create2.RIGHT_ENCODER: right % 65536, 22: 15000, 25: 2500, 26: 2696, 35: 2}
-        return {p: known.get(p, 0) for p in packets}
-
-    def emit(self, now_s: float) -> bytes:
-        """See `ByteDevice`."""
-        out = bytearray(self._outbox)
-        self._outbox.clear()
-        for time_s in self._times(now_s):
-            if self._is_streaming and self._packets:
-                out += create2.encode_stream(self._values(time_s, self._packets))
-        return bytes(out)
-
-
-class KobukiSim(_Streaming):
+class KobukiSim(Streaming):
     """Streams core and inertia sub-payloads at 50 Hz from power-up."""
 
     baud = 115200
@@ -140,7 +88,7 @@ class KobukiSim(_Streaming):
 
     def emit(self, now_s: float) -> bytes:
         """See `ByteDevice`."""
-        return b"".join(self._frame(time_s) for time_s in self._times(now_s))
+        return b"".join(self._frame(time_s) for time_s in self.times(now_s))
 
     def _frame(self, time_s: float) -> bytes:
         left, right = self.counting.at(time_s)
@@ -186,47 +134,89 @@ class ArduinoBridgeSim:
 
 
 class RoboClawSim:
-    """Answers encoder, speed, version and battery reads, and encoder resets; on USB any baud will do."""
+    """Answers the usual reads, and says FF to the usual writes; on USB any baud and any address will do."""
 
     baud = 0
 
-    def __init__(self, counting: Counting, address: int = roboclaw.FIRST_ADDRESS) -> None:
-        self.counting, self._address = counting, address
+    def __init__(self, counting: Counting) -> None:
+        self.counting = counting
         self._inbox, self._outbox = bytearray(), bytearray()
+        self._heard_s = 0.0
+        self._last: tuple[float, int, int] | None = None  # time and counters at the last question for speeds
 
     def fault(self, kind: str, value: float, now_s: float) -> None:
         """See `Counting.fault`."""
         self.counting.fault(kind, value, now_s)
 
     def receive(self, data: bytes, now_s: float) -> None:
-        """See `ByteDevice`; a partial command is dropped with whatever follows it in the next write."""
-        self._inbox[:] = data[-64:]
+        """See `ByteDevice`; half a command is dropped when the rest does not follow."""
+        if now_s - self._heard_s > PARTIAL_COMMAND_S:
+            self._inbox.clear()
+        self._heard_s = now_s
+        self._inbox += data
         while len(self._inbox) >= 2:
-            question = bytes(self._inbox[:2])
-            if question[0] != self._address:
+            if not roboclaw.FIRST_ADDRESS <= self._inbox[0] <= roboclaw.LAST_ADDRESS:
                 del self._inbox[0]
                 continue
-            used = 4 if question[1] == roboclaw.RESET_ENCODERS else 2
-            self._obey(question, now_s)
-            del self._inbox[:used]
+            n = _ROBOCLAW_WRITES.get(self._inbox[1])
+            size = 2 if n is None else 4 + n
+            if len(self._inbox) < size:
+                return
+            command = bytes(self._inbox[:size])
+            del self._inbox[:size]
+            if n is None:
+                self._tell(command, now_s)
+            elif roboclaw.crc16(command) == 0:
+                self._obey(command, now_s)
 
-    def _obey(self, question: bytes, now_s: float) -> None:
-        left, right = self.counting.at(now_s)
-        if question[1] == roboclaw.RESET_ENCODERS:
+    def _obey(self, command: bytes, now_s: float) -> None:
+        if command[1] == roboclaw.RESET_ENCODERS:
             self.counting.fault("encoder-reset", 0, now_s)
-            self._outbox += b"\xff"
-        elif question[1] == roboclaw.READ_ENCODERS:
-            self._outbox += roboclaw.encode_counts(self._address, left, right)
-        elif question[1] in (16, 17):
-            count = (left if question[1] == 16 else right) % 2**32
-            self._outbox += roboclaw.sealed(question, struct.pack(">IB", count, 0))
-        elif question[1] == 21:
-            self._outbox += roboclaw.sealed(question, b"USB Roboclaw 2x15a v4.1.34\n\0")
-        elif question[1] == 24:
-            self._outbox += roboclaw.sealed(question, struct.pack(">H", 124))
+        self._outbox += b"\xff"
+
+    def _tell(self, question: bytes, now_s: float) -> None:
+        left, right = self.counting.at(now_s)
+        counts = {roboclaw.READ_M1: left, roboclaw.READ_M2: right}
+        code = question[1]
+        if code in counts:
+            self._say(question, struct.pack(">IB", counts[code] % 2**32, 0))
+        elif code in (18, 19, 30, 31):
+            speed = self._speeds(now_s, left, right)[code in (19, 31)]
+            self._say(question, struct.pack(">iB", speed, speed < 0))
+        elif code == 79:
+            self._say(question, struct.pack(">ii", *self._speeds(now_s, left, right)))
+        elif code == roboclaw.READ_ENCODERS:
+            self._say(question, struct.pack(">II", left % 2**32, right % 2**32))
+        elif code in _ROBOCLAW_FACTS:
+            self._say(question, _ROBOCLAW_FACTS[code])
+
+    def _speeds(self, now_s: float, left: int, right: int) -> tuple[int, int]:
+        """Ticks a second since the last such question."""
+        before_s, before_left, before_right = self._last or (now_s, left, right)
+        if now_s - before_s > 0.01 or self._last is None:
+            self._last = now_s, left, right
+        seconds = max(now_s - before_s, 0.01)
+        return round((left - before_left) / seconds), round((right - before_right) / seconds)
+
+    def _say(self, question: bytes, data: bytes) -> None:
+        self._outbox += roboclaw.sealed(question, data)
 
     def emit(self, now_s: float) -> bytes:
         """See `ByteDevice`."""
         out = bytes(self._outbox)
         self._outbox.clear()
         return out
+
+
+PARTIAL_COMMAND_S = 0.03  # the board's 10 ms, and what a busy computer adds
+_ROBOCLAW_FACTS = {
+    roboclaw.READ_VERSION: b"USB Roboclaw 2x15a v4.1.34\n\0",
+    roboclaw.READ_MAIN_BATTERY: struct.pack(">H", 124),  # tenths of a volt
+    25: struct.pack(">H", 50),
+    48: struct.pack(">hh", 0, 0),  # duty
+    49: struct.pack(">hh", 0, 0),  # hundredths of an ampere
+    82: struct.pack(">H", 250),  # tenths of a degree
+    90: struct.pack(">I", 0),  # no fault
+}
+_ROBOCLAW_WRITES = dict.fromkeys((0, 1, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14), 1) | {20: 0, 22: 4, 23: 4, 28: 16, 29: 16}
+_ROBOCLAW_WRITES |= {32: 2, 33: 2, 34: 4, 35: 4, 36: 4, 37: 8, 38: 8, 39: 8, 40: 12}  # bytes behind address and command

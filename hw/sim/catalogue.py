@@ -8,12 +8,14 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from hw import create2, kobuki, wheels, xv11
-from hw.sim.bases_sim import ArduinoBridgeSim, Counter, Counting, Create2Sim, KobukiSim, RoboClawSim, Wt1Ticks
+from hw.sim.bases_sim import ArduinoBridgeSim, Counter, Counting, KobukiSim, RoboClawSim, Wt1Ticks
+from hw.sim.create2_sim import Create2Sim
 from hw.sim.devices import ByteDevice, Wt1Board
+from hw.sim.hokuyo_sim import MODELS as HOKUYOS
+from hw.sim.hokuyo_sim import HokuyoSim
 from hw.sim.robot import DriveOptions
 from hw.sim.rplidar_sim import UNITS, RplidarSim
-from hw.sim.scanners_sim import MODELS as HOKUYOS
-from hw.sim.scanners_sim import HokuyoSim, SickSim
+from hw.sim.sick_sim import SickSim
 from hw.sim.sight import Sight
 from hw.sim.spinning_sim import YDLIDARS, LdrobotSim, NeatoSim, YdlidarSim
 
@@ -59,6 +61,7 @@ LIDARS: dict[str, tuple[Callable[[Sight], ByteDevice], str]] = {
     **{name: (partial(LdrobotSim, name), f"{name}:{{}}") for name in ("ld06", "ld19", "stl27l")},
     **{f"ydlidar-{name}": (partial(YdlidarSim, name), f"ydlidar:{{}}?model={name}") for name in YDLIDARS},
     **{name: (partial(HokuyoSim, parameters), "hokuyo:{}") for name, parameters in HOKUYOS.items()},
+    "hokuyo-urg-rs232": (partial(HokuyoSim, HOKUYOS["hokuyo-urg"], baud=19200), "hokuyo:{}"),
     "sick-lms291": (SickSim, "sick:{}"),
     "xv11": (partial(NeatoSim, xv11.XV11), "xv11:{}"),
     "lds01": (partial(NeatoSim, xv11.LDS01), "lds01:{}"),

@@ -60,6 +60,7 @@ class YdlidarUnit:
     sample_bytes: int
 
 
+OLD_HEALTH, OLD_RESET = 0x91, 0x40  # what hosts written for the first X4 and G4 send
 YDLIDARS = {"x2": YdlidarUnit(6, 3000, 6.0, 2), "x4": YdlidarUnit(6, 5000, 8.0, 2), "g2": YdlidarUnit(15, 5000, 10.0, 3)}
 
 
@@ -94,12 +95,12 @@ class YdlidarSim:
                 del self._inbox[0]
 
     def _obey(self, code: int, now_s: float) -> None:
-        if code in (ydlidar.STOP, ydlidar.FORCE_STOP, ydlidar.RESET):
+        if code in (ydlidar.STOP, ydlidar.FORCE_STOP, ydlidar.RESET, OLD_RESET):
             self._is_sending = False
         elif code == ydlidar.INFO:
             body = ydlidar.info_body(self._unit.number, (1, 5), 1, list(range(10)) + [0] * 6)
             self._outbox += ydlidar.answer(ydlidar.INFO_TYPE, body)
-        elif code == ydlidar.HEALTH:
+        elif code in (ydlidar.HEALTH, OLD_HEALTH):
             self._outbox += ydlidar.answer(ydlidar.HEALTH_TYPE, bytes((self._status, 0, 0)))
         elif code in (ydlidar.SCAN, 0x61):
             self._outbox += Descriptor(5, True, ydlidar.SCAN_TYPE).encode()

@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from hw import hokuyo, ld06, rplidar_nodes, rplidar_wire, sick_lms, wheels, xv11, ydlidar
+from hw import ld06, rplidar_nodes, rplidar_wire, scip, sick_lms, wheels, xv11, ydlidar
 from hw.driver import Driver
 from hw.readings import LaserScan
 from tests.harness.lidar_streams import STREAMS, Stream
@@ -38,7 +38,7 @@ PLAIN = (  # total functions from one frame's bytes to a value or None
     ydlidar.decode,
     sick_lms.decode,
     sick_lms.ScanPayload.decode,
-    hokuyo.decode_message,
+    scip.decode_message,
     wheels.decode,
 )
 

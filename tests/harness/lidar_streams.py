@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hw import hokuyo, ld06, rplidar_hq, rplidar_wire, sick_lms, xv11, ydlidar
+from hw import ld06, rplidar_hq, rplidar_wire, scip, sick_lms, xv11, ydlidar
 from hw.driver import Driver
 from hw.hokuyo import Hokuyo
 from hw.ld06 import Ld06
@@ -175,14 +175,14 @@ def neato(kind: xv11.Kind, seconds: float = 2.0, hz: float = 5.0) -> Stream:
     return Stream(kind.name, lambda: Xv11(kind), b"".join(out) * round(seconds * hz), seconds)
 
 
-def hokuyo_scans(parameters: hokuyo.Parameters = hokuyo.UTM_30LX, seconds: float = 2.0) -> Stream:
+def hokuyo_scans(parameters: scip.Parameters = scip.UTM_30LX, seconds: float = 2.0) -> Stream:
     """Continuous MD scans."""
     steps = np.arange(parameters.first_step, parameters.last_step + 1)
     mm = _ints(_mm((steps - parameters.front_step) * 360.0 / parameters.steps_per_turn, 1.0))
     echo = f"MD{parameters.first_step:04d}{parameters.last_step:04d}01000".encode()
     n = round(seconds * parameters.rpm / 60)
-    out = [hokuyo.encode_scan(echo, round(k * 60000 / parameters.rpm) % 2**24, mm) for k in range(n)]
-    prefix = hokuyo.encode_message(b"PP", b"00", parameters.lines())
+    out = [scip.encode_scan(echo, round(k * 60000 / parameters.rpm) % 2**24, mm) for k in range(n)]
+    prefix = scip.encode_message(b"PP", b"00", parameters.lines())
     return Stream(f"hokuyo-{parameters.model}", Hokuyo, b"".join(out), seconds, prefix)
 
 
@@ -209,8 +209,8 @@ STREAMS: dict[str, Callable[..., Stream]] = {
     "ydlidar-4B": lambda **kw: ydlidar_packets(sample_bytes=4, **kw),
     "xv11": lambda **kw: neato(xv11.XV11, **kw),
     "lds01": lambda **kw: neato(xv11.LDS01, **kw),
-    "hokuyo-urg": lambda **kw: hokuyo_scans(hokuyo.URG_04LX, **kw),
-    "hokuyo-utm": lambda **kw: hokuyo_scans(hokuyo.UTM_30LX, **kw),
+    "hokuyo-urg": lambda **kw: hokuyo_scans(scip.URG_04LX, **kw),
+    "hokuyo-utm": lambda **kw: hokuyo_scans(scip.UTM_30LX, **kw),
     "sick": sick_scans,
 }
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from hw import hokuyo, rplidar_wire, sick_lms, ydlidar
+from hw import rplidar_wire, scip, sick_lms, ydlidar
 from hw.driver import Driver
 from hw.health import DeviceHealth
 from hw.hokuyo import Hokuyo
@@ -162,20 +162,18 @@ class FakeHokuyo:
         line = data.strip()
         if line == b"QT":
             port.silence()
-            port.say(hokuyo.encode_message(b"QT"))
+            port.say(scip.encode_message(b"QT"))
         elif line == b"SCIP2.0":
-            port.say(hokuyo.encode_message(b"SCIP2.0", b"0E"))
+            port.say(scip.encode_message(b"SCIP2.0", b"0E"))
         elif line == b"PP":
             port.say(self.stream.prefix)
         elif line == b"VV":
-            port.say(
-                hokuyo.encode_message(b"VV", b"00", [b"VEND:Hokuyo Automatic Co.,Ltd.;", b"SERI:H0906091;", b"FIRM:1.18.01;"])
-            )
+            port.say(scip.encode_message(b"VV", b"00", [b"VEND:Hokuyo Automatic Co.,Ltd.;", b"SERI:H0906091;", b"FIRM:1.18.01;"]))
         elif line == b"BM":
-            port.say(hokuyo.encode_message(b"BM", b"10" if self.refusals else b"00"))
+            port.say(scip.encode_message(b"BM", b"10" if self.refusals else b"00"))
             self.refusals -= self.refusals > 0
         elif line.startswith(b"MD"):
-            port.say(hokuyo.encode_message(line))
+            port.say(scip.encode_message(line))
             port.stream(self.stream.data, self.stream.bytes_per_s)
 
 
@@ -238,6 +236,7 @@ def test_a_sick_at_9600_is_found_and_moved_to_the_rate_asked_for(run) -> None:
     assert len(_first_scan(device, 12.0).ranges_m) == 361
     assert (device.health().model, device.health().baud) == ("SICK LMS291", 38400)
     assert 9600 in port.bauds
+    assert device.health().skipped_bytes == 0, "the byte that acknowledges a request is no damage"
 
 
 class FakeYdLidar:

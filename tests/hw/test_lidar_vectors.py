@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hw import hokuyo, ld06, rplidar_wire, sick_lms, xv11, ydlidar
+from hw import ld06, rplidar_wire, scip, sick_lms, xv11, ydlidar
 from hw.rplidar import Rplidar
 from hw.rplidar_nodes import Node
 
@@ -107,16 +107,16 @@ def test_ydlidar_angles_are_corrected_as_the_vendor_says() -> None:
 @pytest.mark.parametrize("vector", _of("scip", "sum"))
 def test_scip_sum(vector: dict[str, Any]) -> None:
     text = vector["text"].encode()
-    assert chr(hokuyo.line_sum(text)) == vector["expect"]
-    assert hokuyo.is_line_good(text + vector["expect"].encode())
+    assert chr(scip.line_sum(text)) == vector["expect"]
+    assert scip.is_line_good(text + vector["expect"].encode())
 
 
 @pytest.mark.parametrize("vector", _of("scip", "value"))
 def test_scip_value(vector: dict[str, Any]) -> None:
     text = vector["text"].encode()
-    assert hokuyo.decode_value(text) == vector["expect"]
-    assert hokuyo.encode_value(vector["expect"], len(text)) == text
-    assert hokuyo.decode_values(text * 3, len(text)).tolist() == [vector["expect"]] * 3
+    assert scip.decode_value(text) == vector["expect"]
+    assert scip.encode_value(vector["expect"], len(text)) == text
+    assert scip.decode_values(text * 3, len(text)).tolist() == [vector["expect"]] * 3
 
 
 @pytest.mark.parametrize("vector", _of("sick_lms2xx", "frame"))

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hw import hokuyo, ld06, sick_lms, xv11, ydlidar
+from hw import ld06, scip, sick_lms, xv11, ydlidar
 from hw.hokuyo import Hokuyo
 from hw.sick_lms import SickLms
 from hw.ydlidar import YdLidar
@@ -62,26 +62,26 @@ def test_tof_ydlidars_count_whole_millimetres_and_are_not_corrected() -> None:
 @given(st.integers(0, 2**24 - 1), st.integers(2, 4))
 def test_scip_values(value: int, characters: int) -> None:
     value %= 64**characters
-    text = hokuyo.encode_value(value, characters)
+    text = scip.encode_value(value, characters)
     assert all(0x30 <= byte <= 0x6F for byte in text)
-    assert hokuyo.decode_value(text) == value
+    assert scip.decode_value(text) == value
 
 
 @pytest.mark.parametrize("echo", [b"MD0000010000100", b"MS0000010000100", b"ME0000010000100", b"GD0000010000"])
 def test_hokuyo_scan_messages(echo: bytes) -> None:
     mm = [(37 * k) % 4096 for k in range(101)]
     intensities = [k * 11 for k in range(101)] if echo[1:2] == b"E" else None
-    message = hokuyo.decode_message(hokuyo.encode_scan(echo, 123456, mm, intensities)[:-2])
+    message = scip.decode_message(scip.encode_scan(echo, 123456, mm, intensities)[:-2])
     assert message is not None
-    scan = hokuyo.scan_of(message)
+    scan = scip.scan_of(message)
     assert scan is not None
     assert (scan.clock_ms, scan.values.tolist()) == (123456, mm)
     assert (scan.intensities.tolist() if scan.intensities is not None else None) == intensities
 
 
 def test_hokuyo_error_codes_are_no_ranges_and_nothing_in_range_is_free_only_when_asked() -> None:
-    parameters = hokuyo.encode_message(b"PP", b"00", hokuyo.UTM_30LX.lines())
-    data = parameters + hokuyo.encode_scan(b"MD0000108001000", 0, [1, 2, 5, 22, 23, 60000] + [1000] * 1075)
+    parameters = scip.encode_message(b"PP", b"00", scip.UTM_30LX.lines())
+    data = parameters + scip.encode_scan(b"MD0000108001000", 0, [1, 2, 5, 22, 23, 60000] + [1000] * 1075)
     for is_free, first in ((False, np.nan), (True, np.inf)):
         scan = Hokuyo(sees_nothing_as_free=is_free).feed(data, 1.0)[0]
         assert np.array_equal(scan.ranges_m[:4], np.array([first, np.nan, np.nan, np.nan], np.float32), equal_nan=True)
@@ -97,10 +97,10 @@ def test_a_lost_message_end_costs_the_hokuyo_one_scan() -> None:
 
 
 def test_hokuyo_sums_with_and_without_the_semicolon_are_both_read() -> None:
-    assert hokuyo.is_line_good(b"DMIN:20;4")
+    assert scip.is_line_good(b"DMIN:20;4")
     with_semicolon = b"DMIN:20;"
-    assert hokuyo.is_line_good(with_semicolon + bytes((hokuyo.line_sum(with_semicolon),)))
-    assert not hokuyo.is_line_good(b"DMIN:21;4")
+    assert scip.is_line_good(with_semicolon + bytes((scip.line_sum(with_semicolon),)))
+    assert not scip.is_line_good(b"DMIN:21;4")
 
 
 @pytest.mark.parametrize("n", sick_lms.FIELDS)

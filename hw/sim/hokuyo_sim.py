@@ -1,4 +1,4 @@
-"""Simulated scanners that sweep and are talked to: Hokuyo (SCIP 2.0) and SICK LMS291."""
+"""A simulated Hokuyo that speaks SCIP 2.0: every scan mode, its states and clock, and the bit rate of its serial line."""
 
 from __future__ import annotations
 
@@ -7,20 +7,21 @@ import re
 
 import numpy as np
 
-from hw import hokuyo, sick_lms
-from hw.sim.devices import SickScanner
+from hw import scip
 from hw.sim.sight import Part, Sight, Turntable
 
+MODELS = {"hokuyo-urg": scip.URG_04LX, "hokuyo-utm": scip.UTM_30LX}
 _SCAN = re.compile(rb"([MG])([DSE])(\d{4})(\d{4})(\d{2})(?:(\d)(\d{2}))?$")
 _REFUSED = b"10"
+_TIME_STATUS = {(b"TM0", True): b"02", (b"TM1", False): b"04", (b"TM2", False): b"03"}  # (command, is the clock being read): no
 
 
 class HokuyoSim:
-    """A URG-04LX or a UTM-30LX on USB: any baud will do."""
+    """A URG-04LX or a UTM-30LX.  `baud` 0: on USB, where any will do; else the rate its serial line wakes at."""
 
-    baud = 0
-
-    def __init__(self, parameters: hokuyo.Parameters, sight: Sight) -> None:
+    def __init__(self, parameters: scip.Parameters, sight: Sight, baud: int = 0) -> None:
+        self.baud = self._first_baud = baud
+        self._next_baud = baud  # from the end of the running answer on
         self.parameters, self._sight = parameters, sight
         self._inbox, self._outbox = bytearray(), bytearray()
         sweep = (parameters.first_step, parameters.last_step + 1)
@@ -53,7 +54,7 @@ class HokuyoSim:
                 self._obey(line, now_s)
 
     def _say(self, line: bytes, status: bytes = b"00", lines: list[bytes] | None = None) -> None:
-        self._outbox += hokuyo.encode_message(line, status, lines or [])
+        self._outbox += scip.encode_message(line, status, lines or [])
 
     def _obey(self, line: bytes, now_s: float) -> None:
         command = line.partition(b";")[0]
@@ -62,27 +63,62 @@ class HokuyoSim:
         elif command == b"PP":
             self._say(line, lines=self.parameters.lines())
         elif command == b"VV":
-            told = ("VEND:Hokuyo Automatic Co.,Ltd.", f"PROD:SOKUIKI Sensor {self.parameters.model}", "FIRM:3.3.00")
-            self._say(line, lines=[f"{t};".encode() for t in (*told, "PROT:SCIP 2.0", "SERI:H0000001")])
+            self._say(line, lines=_version())
         elif command == b"II":
-            laser = "ON" if self._is_laser_on else "OFF"
-            state = (f"MODL:{self.parameters.model}", f"LASR:{laser}", f"SCSP:{self.parameters.rpm}", "MESM:Measuring")
-            time_ms = hokuyo.encode_value(self._clock_ms(now_s), 4).decode("latin-1")
-            self._say(
-                line,
-                lines=[f"{t};".encode("latin-1") for t in (*state, "SBPS:USB", f"TIME:{time_ms}", "STAT:Sensor works well.")],
-            )
+            self._say(line, lines=self._state(now_s))
         elif command == b"BM":
             self._laser_on(line, now_s)
         elif command in (b"QT", b"RS", b"RT"):
-            self._is_laser_on, self._echo = False, b""
+            self._is_laser_on, self._echo, self._is_timing = False, b"", False
+            self._once.clear()
+            self._next_baud = self._first_baud if command == b"RS" else self.baud
             self._say(line)
         elif command in (b"TM0", b"TM1", b"TM2"):
-            self._say(line, lines=[hokuyo.encode_value(self._clock_ms(now_s), 4)] if command == b"TM1" else [])
-        elif command in (b"SCIP2.0", b"HS0", b"HS1", b"CR00") or command.startswith(b"SS"):
+            self._time(line, command, now_s)
+        elif command == b"%ST":
+            self._say(line, lines=[b"%03d" % self._status(now_s)])
+        elif command.startswith(b"SS"):
+            self._set_rate(line, command[2:])
+        elif command in (b"SCIP2.0", b"HS0", b"HS1") or re.match(rb"CR\d\d$", command):
             self._say(line)
         else:
             self._say(line, b"0E")
+
+    def _state(self, now_s: float) -> list[bytes]:
+        """What II tells."""
+        told = {
+            "MODL": self.parameters.model,
+            "LASR": "ON" if self._is_laser_on else "OFF",
+            "SCSP": f"Initial({self.parameters.rpm}[rpm])",
+            "MESM": "Measuring by Normal" if self._echo else "IDLE",
+            "SBPS": f"{self.baud}[bps]" if self.baud else "USB only",
+            "TIME": f"{self._clock_ms(now_s):06X}",
+            "STAT": "Sensor works well.",
+        }
+        return [f"{key}:{value};".encode() for key, value in told.items()]
+
+    def _status(self, now_s: float) -> int:
+        """0 standby, 1 booting, 2 time mode, 3 single scans, 4 a stream."""
+        if now_s < self._booting_until_s:
+            return 1
+        return 2 if self._is_timing else 4 if self._echo else 3 if self._is_laser_on else 0
+
+    def _time(self, line: bytes, command: bytes, now_s: float) -> None:
+        refusal = _TIME_STATUS.get((command, self._is_timing))
+        if refusal is None:
+            self._is_timing = command != b"TM2"
+        is_asked = command == b"TM1" and refusal is None
+        self._say(line, refusal or b"00", [scip.encode_value(self._clock_ms(now_s), 4)] if is_asked else [])
+
+    def _set_rate(self, line: bytes, digits: bytes) -> None:
+        rate = int(digits) if digits.isdigit() and len(digits) == 6 else 0
+        if rate not in scip.RATES:
+            self._say(line, b"04" if rate else b"01")
+        elif rate == self.baud:
+            self._say(line, b"03")
+        else:
+            self._say(line)
+            self._next_baud = rate if self.baud else 0
 
     def _laser_on(self, line: bytes, now_s: float) -> None:
         if now_s < self._booting_until_s:
@@ -97,18 +133,25 @@ class HokuyoSim:
             self._say(line, b"04" if last > self.parameters.last_step else b"05")
         elif now_s < self._booting_until_s:
             self._say(line, _REFUSED)
-        elif match[1] == b"G":
-            self._once.append(line)
-        elif match[6] is not None:
+        elif match[1] == b"G" and match[6] is None:
+            if self._is_laser_on and not self._echo:
+                self._once.append(line)
+            else:
+                self._say(line, _REFUSED)
+        elif match[1] == b"G" or match[6] is None:
+            self._say(line, b"0D" if match[1] == b"G" else b"0C")
+        else:
             self._say(line)
             count = int(match[7])
             self._echo, self._left = line, count or None
             self._skip, self._skipped, self._is_laser_on = int(match[6]), 0, True
 
     def emit(self, now_s: float) -> bytes:
-        """See `ByteDevice`."""
+        """See `ByteDevice`; a new bit rate holds from behind the answer that grants it."""
         out = bytearray(self._outbox)
         self._outbox.clear()
+        if not out:
+            self.baud = self._next_baud
         for sweep in self._head.due(now_s):
             if self._once and self._is_laser_on:
                 out += b"".join(self._message(line, sweep, None) for line in self._once)
@@ -146,65 +189,13 @@ class HokuyoSim:
             command = command[:-2] + b"%02d" % left
         # The sensor's clock is read when its beam passes step 0.
         zero_s = float(sweep.times_s[0]) - p.first_step * 60.0 / p.rpm / p.steps_per_turn
-        return hokuyo.encode_scan(command + semicolon + tag, self._clock_ms(zero_s), values, intensities)
+        return scip.encode_scan(command + semicolon + tag, self._clock_ms(zero_s), values, intensities)
 
     def _clock_ms(self, time_s: float) -> int:
         return int((time_s + self._clock_offset_s) * 1e3) % 2**24
 
 
-MODELS = {"hokuyo-urg": hokuyo.URG_04LX, "hokuyo-utm": hokuyo.UTM_30LX}
-
-
-class SickSim(SickScanner):
-    """A SICK LMS291 that wakes at 9600 baud, in centimetres or millimetres, 180 or 100 degrees."""
-
-    def __init__(self, sight: Sight) -> None:
-        super().__init__(_Nothing())
-        self.baud = 9600
-        self._sight = sight
-        self._field_deg, self._step_deg, self._is_mm = 180.0, 0.5, True
-        self._next_s: float | None = None
-
-    def _answer(self, payload: bytes) -> bytes:
-        if payload[0] == sick_lms.VARIANT and len(payload) == 5:
-            self._field_deg, self._step_deg = float(payload[1]), (payload[3] | payload[4] << 8) / 100.0
-        if payload[0] == 0x74:
-            return b"\xf4" + self._config() + b"\x10"
-        if payload[0] == 0x77 and len(payload) > 7:
-            self._is_mm = payload[7] == 1
-            return b"\xf7\x01" + payload[1:] + b"\x10"
-        return super()._answer(payload)
-
-    def _config(self) -> bytes:
-        """The 32 bytes of the configuration; the sixth is the measuring mode, the seventh the unit."""
-        return bytes((0, 0, 70, 0, 0, 6 if self._is_mm else 0, 1 if self._is_mm else 0)) + bytes(25)
-
-    def emit(self, now_s: float) -> bytes:
-        """See `ByteDevice`: as many scans as the line carries."""
-        out = super().emit(now_s)
-        if not self._is_sending:
-            self._next_s = None
-            return out
-        n = round(self._field_deg / self._step_deg) + 1
-        period_s = max(sick_lms.MIRROR_S / self._step_deg, (10 + 2 * n) * 10.0 / self.baud)
-        if self._next_s is None or now_s - self._next_s > 0.5:
-            self._next_s = now_s + period_s
-        while self._next_s <= now_s:
-            out += self._telegram(n, self._next_s - (10 + 2 * n) * 10.0 / self.baud)
-            self._next_s += period_s
-        return out
-
-    def _telegram(self, n: int, end_s: float) -> bytes:
-        duration_s = sick_lms.MIRROR_S / self._step_deg * self._field_deg / 360.0
-        angles_rad = np.radians(np.arange(n) * self._step_deg - self._field_deg / 2)
-        times_s = np.linspace(end_s - duration_s, end_s, n)
-        far_m, nothing, scale = (32.0, 0x7FFF, 1e3) if self._is_mm else (80.0, 0x1FFF, 1e2)
-        ranges_m = self._sight.ranges_m(times_s, angles_rad, 0.05, far_m)
-        values = np.where(np.isfinite(ranges_m), np.rint(np.where(np.isfinite(ranges_m), ranges_m, 0) * scale), nothing)
-        return sick_lms.scan_telegram([int(v) for v in values], self._is_mm)
-
-
-class _Nothing:
-    def scans_until(self, now_s: float) -> list[list[int]]:
-        """See `ScanSource`."""
-        return []
+def _version() -> list[bytes]:
+    """What VV tells."""
+    told = ("VEND:Hokuyo Automatic Co.,Ltd.", "PROD:SOKUIKI Sensor", "FIRM:3.3.00", "PROT:SCIP 2.0", "SERI:H0000001")
+    return [f"{text};".encode() for text in told]

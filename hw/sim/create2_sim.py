@@ -1,0 +1,90 @@
+"""A simulated iRobot Create 2: its Open Interface as far as a host can tell it from the real one (SERIAL.md 7.1).
+
+Every command is understood by its length, every sensor packet and group has its size and a plausible value; the wheel
+counters are those of whatever turns the wheels.  It starts in the off mode, as after power-up, and hears only START and RESET.
+"""
+
+from __future__ import annotations
+
+import math
+
+from hw import create2
+from hw.sim.bases_sim import Counting, Streaming
+
+OFF, PASSIVE, SAFE, FULL = range(4)
+_MODES = {create2.START: PASSIVE, create2.SAFE: SAFE, 132: FULL, 133: PASSIVE, 143: PASSIVE, 173: OFF}
+_RESET, _QUERY, _QUERY_LIST, _SONG = 7, 142, 149, 140
+_LENGTHS = {129: 2, 137: 5, 138: 2, 139: 4, 141: 2, 142: 2, 144: 4, 145: 5, 146: 5, 150: 2, 162: 3, 163: 5, 164: 5, 165: 2}
+_LENGTHS |= {167: 16, 168: 4}  # of a command with its operands; those not here are one byte long
+_VALUES = {22: 15000, 23: -250, 24: 25, 25: 2500, 26: 2696, 34: 0, 58: 2}  # mV, mA, degrees, mAh, mAh, sources, stasis
+ANSWER_S = 0.004  # a host may clear its input right after it has asked, as the real robot is not that quick
+_BOOT = ((0.0, b"Soft reset!\n"), (1.0, b"\xfe"), (3.0, b"Roomba by iRobot!\r\nstm32\r\n"))  # seconds after RESET
+
+
+class Create2Sim(Streaming):
+    """`ByteDevice`."""
+
+    baud = 115200
+
+    def __init__(self, counting: Counting) -> None:
+        super().__init__(counting, 0.015)
+        self._inbox = bytearray()
+        self._mode = OFF
+        self._stream: list[int] = []
+        self._is_streaming = False
+        self._said: list[tuple[float, bytes]] = []  # when, and what
+        self._booted_s = -math.inf
+
+    def receive(self, data: bytes, now_s: float) -> None:
+        """See `ByteDevice`."""
+        self._inbox += data
+        while self._inbox and len(self._inbox) >= (size := self._size()):
+            command = bytes(self._inbox[:size])
+            del self._inbox[:size]
+            if now_s >= self._booted_s and (self._mode != OFF or command[0] in (create2.START, _RESET)):
+                self._obey(command, now_s)
+
+    def _size(self) -> int:
+        """Of the command at the front, as far as its first bytes tell."""
+        code, n = self._inbox[0], len(self._inbox)
+        if code in (create2.STREAM, _QUERY_LIST):
+            return 2 + self._inbox[1] if n > 1 else 2
+        if code == _SONG:
+            return 3 + 2 * self._inbox[2] if n > 2 else 3
+        return _LENGTHS.get(code, 1)
+
+    def _obey(self, command: bytes, now_s: float) -> None:
+        code = command[0]
+        self._mode = _MODES.get(code, self._mode)
+        if code == create2.STREAM:
+            self._stream, self._is_streaming = [p for p in command[2:] if p in create2.SIZES], True
+        elif code == create2.PAUSE_STREAM:
+            self._is_streaming = command[1] == 1
+        elif code in (_QUERY, _QUERY_LIST):
+            asked = command[1:] if code == _QUERY else command[2:]
+            self._said.append((now_s + ANSWER_S, self._answer(asked, now_s)))
+        elif code == _RESET:
+            self._mode, self._is_streaming = OFF, False
+            self._said = [(now_s + later_s, text) for later_s, text in _BOOT]
+            self._booted_s = self._said[-1][0]
+        elif code == 173:
+            self._is_streaming = False
+
+    def _answer(self, asked: bytes, now_s: float) -> bytes:
+        packets = [p for a in asked for p in create2.GROUPS.get(a, (a,)) if p in create2.SIZES]
+        values = self._values(now_s, packets)
+        return b"".join(create2.encode_value(p, values[p]) for p in packets)
+
+    def _values(self, time_s: float, packets: list[int]) -> dict[int, int]:
+        left, right = self.counting.at(time_s)
+        known = {**_VALUES, create2.LEFT_ENCODER: left, create2.RIGHT_ENCODER: right, 35: self._mode, 38: len(self._stream)}
+        return {p: known.get(p, 0) for p in packets}
+
+    def emit(self, now_s: float) -> bytes:
+        """See `ByteDevice`."""
+        out = bytearray().join(text for due_s, text in self._said if due_s <= now_s)
+        self._said = [(due_s, text) for due_s, text in self._said if due_s > now_s]
+        for time_s in self.times(now_s):
+            if self._is_streaming and self._stream:
+                out += create2.encode_stream(self._values(time_s, self._stream))
+        return bytes(out)
