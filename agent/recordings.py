@@ -51,10 +51,15 @@ def open_recording(path: Path, scan_topic: str | None = None, odometry_topic: st
 
 def carmen_readings(scans: Iterable[RecordedScan]) -> Iterator[LaserScan | Odometry]:
     """Motions from scan to scan, chained to the odometry a robot would have had; an unknown one is a discontinuity."""
-    T_odom_base = SE2.identity()
+    T_odom_base, before_s = SE2.identity(), 0.0
     for scan in scans:
+        for k, (_, motion) in enumerate(scan.way[:-1], 1):  # evenly in time: what the loggers wrote is out of order or zero
+            on_the_way = T_odom_base @ motion
+            stamp_s = before_s + (scan.stamp_s - before_s) * k / len(scan.way)
+            yield Odometry(stamp_s, on_the_way.x_m, on_the_way.y_m, on_the_way.theta_rad)
         if scan.motion is not None:
             T_odom_base = T_odom_base @ scan.motion
+        before_s = scan.stamp_s
         yield Odometry(scan.stamp_s, T_odom_base.x_m, T_odom_base.y_m, T_odom_base.theta_rad, scan.motion is None)
         yield scan.laser_scan()
 

@@ -7,6 +7,9 @@ Ranges are in metres, counter-clockwise from the right. In the Radish recordings
 by somebody's filter, and the wheel odometry restarts at every corrected pose. The raw motion from one scan to the next is
 therefore the last ODOM before the second scan relative to the FLASER pose of the first; chaining these motions gives raw
 odometry, and the corrected pose is never handed on except as `T_map_laser`, the reference that benchmarks compare with.
+
+Some of these logs bear no time: every stamp is zero.  Those get the stamps of a robot that drives at an ordinary speed, for a
+metre within no time is no motion that anybody would believe.
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ import math
 import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +32,8 @@ from protocol.geometry import SE2
 MAX_LINE_CHARS = 20_000
 MAX_BEAMS = 2_000
 MAX_TEXT_BYTES = 1 << 30
+CRUISE_M_S, CRUISE_RAD_S = 0.5, 0.8  # of a robot whose logger had no clock
+FASTEST = 6.0  # times as fast as that on the average: the clock is none
 NO_RETURN_M = 79.9  # SICK and most others write 80 m and more for "nothing came back"; shorter scanners say their own below
 
 
@@ -35,10 +41,12 @@ NO_RETURN_M = 79.9  # SICK and most others write 80 m and more for "nothing came
 class RecordedScan:
     """One FLASER line and how the robot had moved."""
 
-    stamp_s: float  # of the log, seconds since its start
+    stamp_s: float  # seconds since the first scan
+    written_s: float  # as the log says
     ranges_m: NDArray[np.float32]  # (N,) counter-clockwise from -90 deg; `inf` where nothing came back
     angles_rad: NDArray[np.float32]  # (N,)
     motion: SE2 | None  # raw wheel motion since the scan before; None: not recorded
+    way: tuple[tuple[float, SE2], ...]  # every ODOM since the scan before: its stamp as written, and the raw motion until then
     T_map_laser: SE2  # the reference filter's pose: to compare with, never to map with
 
     def laser_scan(self, range_max_m: float = 80.0) -> LaserScan:
@@ -69,7 +77,7 @@ def read_recording(path: str | Path) -> Recording:
     file = Path(path)
     try:
         with (gzip.open if file.suffix == ".gz" else open)(file, "rt", encoding="ascii", errors="replace") as lines:
-            scans = tuple(recorded_scans(_bounded(lines, file)))
+            scans = with_a_clock(tuple(recorded_scans(_bounded(lines, file))))
     except FileNotFoundError as error:
         raise DeviceConfigError(f"{file}: no such recording") from error
     except (OSError, EOFError, zlib.error) as error:
@@ -81,24 +89,34 @@ def read_recording(path: str | Path) -> Recording:
 
 def recorded_scans(lines: Iterable[str]) -> Iterator[RecordedScan]:
     """Scans from the lines of a log; lines that are no whole FLASER or ODOM are passed over."""
-    odometry: SE2 | None = None  # the last ODOM since the last FLASER
+    odometry: list[tuple[float, SE2]] = []  # every ODOM since the last FLASER
     before: SE2 | None = None  # corrected pose of the last FLASER: where the odometry restarted
     first_stamp_s: float | None = None
     for line in lines:
         if line.startswith("ODOM "):
-            values = _numbers(line.split()[1:4])
-            odometry = SE2(*values) if len(values) == 3 else odometry
+            values = _numbers(line.split()[1:8])
+            if len(values) == 7:
+                odometry.append((values[6], SE2(*values[:3])))
         elif line.startswith("FLASER "):
             parsed = _flaser(line.split())
             if parsed is None:
                 continue
             stamp_s, ranges_m, pose = parsed
             first_stamp_s = stamp_s if first_stamp_s is None else first_stamp_s
-            motion = None if before is None or odometry is None else before.inverse() @ odometry
-            if before is None:
-                motion = SE2.identity()
-            yield RecordedScan(stamp_s - first_stamp_s, ranges_m, beam_angles_rad(len(ranges_m)), motion, pose)
-            before, odometry = pose, None
+            way = () if before is None else tuple((s, before.inverse() @ odom) for s, odom in odometry)
+            motion = SE2.identity() if before is None else way[-1][1] if way else None
+            angles_rad = beam_angles_rad(len(ranges_m))
+            yield RecordedScan(stamp_s - first_stamp_s, stamp_s, ranges_m, angles_rad, motion, way, pose)
+            before, odometry = pose, []
+
+
+def with_a_clock(scans: tuple[RecordedScan, ...]) -> tuple[RecordedScan, ...]:
+    """The scans as they are, or, where the clock of the log cannot be true, with the time that their ways take."""
+    motions = [scan.motion or SE2.identity() for scan in scans]
+    seconds = [math.hypot(m.x_m, m.y_m) / CRUISE_M_S + abs(m.theta_rad) / CRUISE_RAD_S for m in motions]
+    if not scans or scans[-1].stamp_s * FASTEST >= sum(seconds):
+        return scans
+    return tuple(replace(scan, stamp_s=stamp_s) for scan, stamp_s in zip(scans, accumulate(seconds), strict=True))
 
 
 def _flaser(words: list[str]) -> tuple[float, NDArray[np.float32], SE2] | None:

@@ -1,12 +1,7 @@
-"""The recordings of ../shared/data as readings, and what they are measured by.
-
-Raw odometry is rebuilt as data/README.md says: in the files it restarts at every corrected pose, so the increments between
-scans are chained again; the corrected pose itself is kept apart, for comparison only.
-"""
+"""The recordings of ../shared/data as readings, as `mapquilt map` reads them, and what they are measured by."""
 
 from __future__ import annotations
 
-import gzip
 import math
 import os
 from dataclasses import dataclass
@@ -15,6 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.recordings import Readings, carmen_readings, in_order
+from hw.carmen import read_recording
 from hw.readings import LaserScan, Odometry
 from protocol.geometry import SE2
 
@@ -89,38 +86,22 @@ def composed(a: NDArray[np.float64], steps: NDArray[np.float64]) -> NDArray[np.f
 
 def load(name: str) -> Recording:
     """One recording with the odometry a robot would have had."""
-    lines = gzip.decompress((SHARED / "data" / "carmen" / f"{name}.log.gz").read_bytes()).decode().splitlines()
-    rows = [words for words in map(str.split, lines) if words and words[0] in ("ODOM", "FLASER")]
-    written_s = np.array([float(w[7] if w[0] == "ODOM" else w[int(w[1]) + 8]) for w in rows])
-    stamps_s = np.minimum.accumulate(written_s[::-1])[::-1] + 1e-6 * np.arange(len(rows))  # some loggers wrote out of order
-    readings: list[LaserScan | Odometry] = []
-    reference, odometry, scan_odometry = [], [], []
-    T_odom_anchor, anchor = SE2.identity(), SE2.identity()  # raw and corrected pose of the last scan: odometry restarts there
-    raw = SE2.identity()
-    for words, stamp_s, original_s in zip(rows, stamps_s, written_s, strict=True):
-        if words[0] == "ODOM":
-            raw = T_odom_anchor @ (anchor.inverse() @ SE2(float(words[1]), float(words[2]), float(words[3])))
-            readings.append(Odometry(stamp_s, raw.x_m, raw.y_m, raw.theta_rad))
-            odometry.append([original_s, raw.x_m, raw.y_m, raw.theta_rad])
-            continue
-        n = int(words[1])
-        T_odom_anchor, anchor = raw, SE2(*(float(w) for w in words[n + 2 : n + 5]))
-        readings.append(Odometry(stamp_s, raw.x_m, raw.y_m, raw.theta_rad))
-        readings.append(scan_of(words, stamp_s, MAX_RANGE_M[name]))
-        scan_odometry.append([raw.x_m, raw.y_m, raw.theta_rad])
-        reference.append([original_s, anchor.x_m, anchor.y_m, anchor.theta_rad])
-    scan_stamps_s = np.array([r.stamp_s for r in readings if isinstance(r, LaserScan)])
+    scans = read_recording(SHARED / "data" / "carmen" / f"{name}.log.gz").scans
+    readings = in_order(Readings(name, list(carmen_readings(scans)))).readings
+    raw, odometry, scan_odometry = SE2.identity(), [], []
+    for scan in scans:
+        odometry += [[stamp_s, *as_row(raw @ motion)] for stamp_s, motion in scan.way]
+        raw = raw @ (scan.motion or SE2.identity())
+        scan_odometry.append(as_row(raw))
     ordered = np.array(sorted(odometry))
     ordered[:, 3] = np.unwrap(ordered[:, 3])
-    return Recording(name, readings, np.array(reference), scan_stamps_s, ordered, np.array(scan_odometry))
+    reference = np.array([[scan.written_s, *as_row(scan.T_map_laser)] for scan in scans])
+    stamps_s = np.array([r.stamp_s for r in readings if isinstance(r, LaserScan)])
+    return Recording(name, list(readings), reference, stamps_s, ordered, np.array(scan_odometry))
 
 
-def scan_of(words: list[str], stamp_s: float, max_range_m: float) -> LaserScan:
-    n = int(words[1])
-    ranges = np.array(words[2 : n + 2], np.float32)
-    ranges[ranges >= max_range_m] = np.inf
-    angles = np.radians(-90.0 + np.arange(n) * (180.0 / (n - n % 2))).astype(np.float32)
-    return LaserScan(stamp_s, ranges, angles, 0.01, max_range_m)
+def as_row(pose: SE2) -> list[float]:
+    return [pose.x_m, pose.y_m, pose.theta_rad]
 
 
 def relation_errors(name: str, trajectory: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -152,3 +152,20 @@ def test_a_real_recording_loses_nothing_on_the_way() -> None:
     scans, track = replayed(recording, 8.0)
     assert len(scans) == len(recording.scans)
     assert sum(odometry.is_discontinuity for odometry in track[1:]) == 0
+
+
+def test_a_log_without_a_clock_gets_the_time_that_its_way_takes(tmp_path: Path) -> None:
+    words = [line.split() for line in log_text(4).splitlines()]
+    stopped = [" ".join([*w[:-3], "0.0", "host", "0.0"]) if w[0] in ("ODOM", "FLASER") else " ".join(w) for w in words]
+    (tmp_path / "a.clf").write_text("\n".join(stopped))
+    scans = read_recording(tmp_path / "a.clf").scans
+    for before, after, step in zip(scans, scans[1:], TRUE_STEPS, strict=False):
+        assert after.stamp_s - before.stamp_s >= math.hypot(step.x_m, step.y_m)  # at most a metre a second
+
+
+def test_the_odometry_on_the_way_to_a_scan_is_kept(log: Path) -> None:
+    scan = read_recording(log).scans[1]
+    assert [close_to(motion, step) for (_, motion), step in zip(scan.way, (SE2.identity(), TRUE_STEPS[0]), strict=True)] == [
+        True
+    ] * 2
+    assert scan.written_s == 101.0
