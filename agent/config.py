@@ -109,6 +109,16 @@ class ViewConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class Ros2Config:
+    """The maps and frames as a node of a ROS 2 graph (rmw_zenoh); no ROS is needed here."""
+
+    enabled: bool = False  # on one robot of a ROS graph, or on a laptop: mapquilt watch --ros2
+    domain: int = setting(-1, low=-1, high=232)  # -1: ROS_DOMAIN_ID, else 0
+    connect: tuple[str, ...] = ("tcp/localhost:7447",)  # where ros2 run rmw_zenoh_cpp rmw_zenohd listens
+    distro: str = setting("jazzy", choices=("humble", "jazzy", "kilted", "lyrical", "rolling"))  # humble's keys lack type hashes
+
+
+@dataclass(frozen=True, slots=True)
 class StateConfig:
     """What survives a restart, and where."""
 
@@ -134,6 +144,7 @@ class Config:
     matching: MatchingConfig = MatchingConfig()
     fleet: FleetConfig = FleetConfig()
     view: ViewConfig = ViewConfig()
+    ros2: Ros2Config = Ros2Config()
     state: StateConfig = StateConfig()
     log: LogConfig = LogConfig()
 

@@ -38,6 +38,7 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
         action = "append" if setting in LISTS else "store"
         group.add_argument(flag, dest=_slot(setting), metavar=placeholder, help=text, action=action)
     group.add_argument("--no-view", action="store_true", help="serve no page")
+    group.add_argument("--ros2", action="store_true", help="show maps and frames to ROS 2 nodes (rmw_zenoh)")
     group.add_argument("--set", dest="assignments", action="append", default=[], metavar="KEY=VALUE", help="any other setting")
 
 
@@ -50,6 +51,8 @@ def load_from(args: argparse.Namespace) -> Loaded:
             flags.append((flag, setting, value))
     if getattr(args, "no_view", False):
         flags.append(("--no-view", "view.enabled", False))
+    if getattr(args, "ros2", False):
+        flags.append(("--ros2", "ros2.enabled", True))
     try:
         flags += [assignment("--set", text) for text in getattr(args, "assignments", [])]
         return load_config(args.config, flags)

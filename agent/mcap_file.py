@@ -11,7 +11,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass, field
 
-from agent.ros_messages import DEFINITIONS
+from agent.ros_messages import DEFINITIONS, nanoseconds
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, STATISTICS, DATA_END = 0x01, 0x02, 0x03, 0x04, 0x05, 0x0B, 0x0F
@@ -62,10 +62,6 @@ class McapFile:
         content += struct.pack("<I", 10 * len(counts))
         content += b"".join(struct.pack("<HQ", number, count) for number, count in enumerate(counts))
         return _record(STATISTICS, content)
-
-
-def nanoseconds(stamp_s: float) -> int:
-    return max(0, round(stamp_s * 1e9))
 
 
 def _record(opcode: int, content: bytes) -> bytes:

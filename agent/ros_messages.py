@@ -64,6 +64,12 @@ def transforms(stamp_s: float, links: Sequence[tuple[str, str, SE2]]) -> bytes:
     return bytes(cdr.data)
 
 
+def nanoseconds(stamp_s: float) -> int:
+    """Whole seconds apart from the rest: today's date in nanoseconds is more than a float holds to the last digit."""
+    whole, rest = divmod(max(0.0, stamp_s), 1.0)
+    return int(whole) * 1_000_000_000 + round(rest * 1e9)
+
+
 class _Cdr:
     """Bytes that grow; every method returns the writer."""
 
@@ -84,7 +90,7 @@ class _Cdr:
         return self.number("I", len(data)).raw(data)
 
     def time(self, stamp_s: float) -> _Cdr:
-        whole, rest = divmod(max(0, round(stamp_s * 1e9)), 1_000_000_000)
+        whole, rest = divmod(nanoseconds(stamp_s), 1_000_000_000)
         return self.number("i", whole).number("I", rest)
 
     def header(self, stamp_s: float, frame: str) -> _Cdr:

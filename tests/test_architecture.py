@@ -28,12 +28,13 @@ MAY_IMPORT = {  # room: what else of ours it may import (itself always)
     "agent.runtime": (
         "protocol", "hw", "agent.mapping", "agent.features", "agent.merging", "agent.fleet",
         "agent.config", "agent.config_sources", "agent.files", "agent.map_files",
+        "agent.ros_frames", "agent.ros_messages", "agent.ros_names",
     ),
     "agent": ("protocol", "hw", "agent"),  # the command line and its commands
 }  # fmt: skip
 PURE = ("protocol", "agent.mapping", "agent.features", "agent.merging", "agent.fleet")
 DOORS = {  # package: the modules that may import it
-    "zenoh": ("agent.runtime.exchange",),
+    "zenoh": ("agent.runtime.exchange", "agent.runtime.announcer"),
     "serial": ("hw.port",),
     "msgpack": ("protocol.codec",),
     "rosbags": ("agent.rosbags_reader",),

@@ -21,6 +21,7 @@ from agent.config_flags import add_config_arguments, load_from
 from agent.exits import BAD_INPUT, OK, PEER, USAGE, CommandError
 from agent.mapping.mapper import Mapper
 from agent.mcap_file import McapFile
+from agent.ros_frames import base_frame, map_frame
 from agent.ros_messages import OCCUPANCY_GRID, PATH, TF, occupancy_grid, path, transforms
 from agent.running import ask_robot, robot_socket, running_robots
 from agent.runtime.keeper import unpacked_map
@@ -136,20 +137,20 @@ def write(exported: Exported, output: Path, formats: list[str], *, quiet: bool =
 
 
 def as_mcap(exported: Exported) -> bytes:
-    """/NAME/map, /NAME/path, and the frames: NAME/map is the parent of every other robot's map and of the robots."""
-    mcap, frame = McapFile(), f"{exported.map_name}/map"
+    """/NAME/map, /NAME/path, and the frames: this map's is the parent of every other robot's map and of the robots."""
+    mcap, frame = McapFile(), map_frame(exported.map_name)
     stamps = exported.trajectory[:, 0].tolist()
     poses = [SE2(x, y, theta) for _, x, y, theta in exported.trajectory.tolist()]
     first_s, last_s = (stamps[0], stamps[-1]) if stamps else (0.0, 0.0)
     mcap.add(f"/{exported.map_name}/map", OCCUPANCY_GRID, first_s, occupancy_grid(exported.grid, first_s, frame))
     if poses:
         mcap.add(f"/{exported.map_name}/path", PATH, last_s, path(stamps, poses, frame))
-    still = [(frame, f"{other}/map", T) for other, T in exported.frames.items()]
-    still += [(frame, f"{other}/base_link", T) for other, T in exported.poses.items() if other != exported.robot or not poses]
+    still = [(frame, map_frame(other), T) for other, T in exported.frames.items()]
+    still += [(frame, base_frame(other), T) for other, T in exported.poses.items() if other != exported.robot or not poses]
     if still:
         mcap.add("/tf", TF, first_s, transforms(first_s, still))
     for stamp_s, pose in zip(stamps, poses, strict=True):
-        mcap.add("/tf", TF, stamp_s, transforms(stamp_s, [(frame, f"{exported.robot}/base_link", pose)]))
+        mcap.add("/tf", TF, stamp_s, transforms(stamp_s, [(frame, base_frame(exported.robot), pose)]))
     return mcap.encoded()
 
 

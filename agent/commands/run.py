@@ -28,6 +28,7 @@ from agent.runtime.exchange import ExchangeError
 from agent.runtime.log_setup import set_up_logging
 from agent.runtime.network import NetworkConfigError
 from agent.runtime.node import Node
+from agent.runtime.ros_bridge import MapSource, RosBridge
 from agent.view.server import ViewServer, ViewSource
 from hw.errors import DeviceConfigError
 
@@ -37,6 +38,7 @@ EXAMPLES = """\
   mapquilt run --lidar rplidar:/dev/ttyUSB0 --wheels wheels:/dev/ttyACM0
   mapquilt run --config robot.toml --id robot-1 --profile lan --security shared
   mapquilt run --id r1 --lidar sim:office?seed=3 --no-view
+  mapquilt run --ros2                                      maps and frames as ROS 2 topics (rmw_zenoh, no ROS needed here)
 """
 
 EXIT_WATCHDOG_S = 12.0  # Zenoh may take 10 s to close a dead link; after that the process goes anyway
@@ -70,6 +72,7 @@ def run(args: argparse.Namespace) -> int:
         page = serve_page(node.keeper, config) if config.view.enabled else None
         if page is not None:
             stack.callback(page.close)
+        join_ros2(node.keeper, config, stack)
         if args.ready_json:
             print(json.dumps(ready_line(node, page)), flush=True)
         log.info("up fleet=%s profile=%s security=%s", config.fleet.name, config.fleet.profile, config.fleet.security)
@@ -127,6 +130,15 @@ def serve_page(source: ViewSource, config: Config) -> ViewServer | None:
         return page
     log.warning("no page: ports %d to %d of %s are taken", wished, wished + PORTS_TRIED - 1, config.view.host)
     return None
+
+
+def join_ros2(source: MapSource, config: Config, stack: contextlib.ExitStack) -> None:
+    """Speak to ROS 2 nodes when asked to; a robot that cannot is still a robot."""
+    if config.ros2.enabled:
+        try:
+            stack.enter_context(RosBridge(source, config.robot.id, config.ros2))
+        except ExchangeError as error:
+            log.warning("no ROS 2: %s", error)
 
 
 def ready_line(node: Node, page: ViewServer | None) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import sys
 import threading
 from dataclasses import replace
 
-from agent.commands.run import StopSignals, serve_page
+from agent.commands.run import StopSignals, join_ros2, serve_page
 from agent.config_flags import add_config_arguments, load_from
 from agent.exits import OK, PEER, USAGE, CommandError
 from agent.runtime.exchange import ExchangeError
@@ -26,6 +26,7 @@ from agent.runtime.watcher import Watcher
 EXAMPLES = """\
   mapquilt watch --connect tcp/192.168.1.20:7447          any robot, or the router
   mapquilt watch --profile lan --set fleet.allow_open=true
+  mapquilt watch --connect tcp/192.168.1.20:7447 --ros2   the fleet's maps and frames for ROS 2 (rmw_zenoh)
 """
 
 
@@ -50,6 +51,7 @@ def run(args: argparse.Namespace) -> int:
             if page is None:
                 raise CommandError(f"no free port from {config.view.port} on; give another with --view-port", USAGE)
             stack.callback(page.close)
+            join_ros2(watcher, config, stack)
             if args.ready_json:
                 print(json.dumps({"ready": True, "robot": name, "pid": os.getpid(), "page": page.url}), flush=True)
             else:

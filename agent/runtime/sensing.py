@@ -32,7 +32,7 @@ class Readings:
         self._came = threading.Condition()
         self._scans: deque[LaserScan] = deque()
         self._odometry: deque[Odometry] = deque(maxlen=MAX_ODOMETRY_WAITING)
-        self._newest_odometry_s = float("-inf")
+        self.newest_odometry: Odometry | None = None
         self.scans_in = 0
         self.scans_lost = 0
         self.odometry_in = 0
@@ -48,7 +48,7 @@ class Readings:
             elif isinstance(reading, Odometry):
                 self.odometry_in += 1
                 self._odometry.append(reading)
-                self._newest_odometry_s = reading.stamp_s
+                self.newest_odometry = reading
             self._came.notify()
 
     def take(self, timeout_s: float, wait_for_odometry_s: float) -> tuple[list[Odometry], LaserScan | None]:
@@ -60,9 +60,11 @@ class Readings:
             if not self._scans:
                 self._came.wait_for(lambda: bool(self._scans), timeout_s)
             scan = self._scans.popleft() if self._scans else None
-            if scan is not None and self.odometry_in:
+            if scan is not None:
                 end_s = scan.stamp_s + scan.duration_s
-                self._came.wait_for(lambda: self._newest_odometry_s >= end_s, wait_for_odometry_s)
+                self._came.wait_for(
+                    lambda: self.newest_odometry is None or self.newest_odometry.stamp_s >= end_s, wait_for_odometry_s
+                )
             odometry = list(self._odometry)
             self._odometry.clear()
             return odometry, scan

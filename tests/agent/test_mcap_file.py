@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import io
 import math
 import struct
@@ -10,6 +9,8 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 
 from agent.mcap_file import CHANNEL, DATA_END, FOOTER, HEADER, MAGIC, MESSAGE, SCHEMA, STATISTICS, McapFile
 from agent.ros_messages import DEFINITIONS, OCCUPANCY_GRID, PATH, TF, occupancy_grid, path, transforms
@@ -82,11 +83,6 @@ def test_an_empty_file_is_a_file() -> None:
 
 
 def test_the_reference_reader_reads_it() -> None:
-    if importlib.util.find_spec("mcap") is None or importlib.util.find_spec("mcap_ros2") is None:
-        pytest.skip("the reference readers mcap and mcap-ros2-support are not installed")
-    from mcap.reader import make_reader  # noqa: PLC0415
-    from mcap_ros2.decoder import DecoderFactory  # noqa: PLC0415
-
     reader = make_reader(io.BytesIO(whole_file()), decoder_factories=[DecoderFactory()])
     found = [(channel.topic, message) for _, channel, _, message in reader.iter_decoded_messages()]
     assert [topic for topic, _ in found] == ["/r1/map", "/tf", "/tf", "/r1/path"]

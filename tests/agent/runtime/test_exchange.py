@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from agent.runtime import announcer as announcer_module
 from agent.runtime import exchange as exchange_module
 from agent.runtime.exchange import MAX_PAYLOAD_BYTES, Exchange, ExchangeError
 from agent.runtime.network import NetworkSettings
@@ -150,10 +151,10 @@ def test_closing_while_a_query_waits_is_prompt(hub: Exchange) -> None:
 
 
 def test_nothing_is_ever_sent_with_block() -> None:
-    source = Path(exchange_module.__file__).read_text()
+    source = "".join(Path(str(module.__file__)).read_text() for module in (exchange_module, announcer_module))
     assert "CongestionControl.BLOCK" not in source
-    sends = len(re.findall(r"session\.(?:put|get)\(\n?\s*key", source))
-    assert source.count("CongestionControl.DROP") == sends == 2
+    sends = len(re.findall(r"session\.(?:put|get)\(\n?\s*key|declare_\w*publisher\(", source))
+    assert source.count("CongestionControl.DROP") == sends == 3
 
 
 ENDINGS = (
