@@ -211,7 +211,7 @@ class Composition:
         return _Recipe(root, resolution_m, members, tuple(sorted(edge.id for edge in group.edges)), None)
 
     def _publish(self, recipe: _Recipe, digest: bytes, conflicting_cells: int, agreeing_cells: int) -> None:
-        """Hand the recipe of the map we hold to whoever asks, even one we followed: its author may be gone.  Composers push it."""
+        """Tell the recipe of the map we hold, even one we followed: its author may be gone.  Composers push it."""
         self._seq += 1
         ledger = self._ledger
         self.meta = GlobalMeta(

@@ -28,6 +28,8 @@ log = logging.getLogger(__name__)
 
 MAX_PAYLOAD_BYTES = 32 * 1024  # hints are made for 16 KB, plus envelope; a single 200 KB put is silently lost on 20 Mbit/s
 QUERY_TIMEOUT_S = 5.0
+ASK_AGAIN_S = 1.5  # a question that went into a link just before it came back stays unanswered
+SLOW_FACTOR = 3.0  # over a slow radio the second question waits for this many times the time the last answer took
 MAX_QUERIES_WAITING = 256
 
 Answer = Callable[[str], "bytes | None"]  # key -> the register's content, ready to travel; runs on the answering thread
@@ -49,11 +51,13 @@ class Traffic:
 
 
 class Pending:
-    """A query on its way.  Filled on Zenoh's thread; `wait` from a worker."""
+    """A question on its way, asked once more when it stays silent.  Filled on Zenoh's thread; `wait` from a worker."""
 
-    def __init__(self) -> None:
+    def __init__(self, ask: Callable[[Pending], bool]) -> None:
         self._arrived: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._count = 0
+        self._ask = ask
+        self._asked = 1
+        self._ended = self._count = 0
 
     def on_reply(self, reply: Any) -> None:
         self._count += 1
@@ -63,17 +67,21 @@ class Pending:
     def on_end(self) -> None:
         self._arrived.put(None)
 
-    def wait(self, timeout_s: float, stopping: threading.Event) -> bytes | None:
+    def wait(self, timeout_s: float, again_s: float, stopping: threading.Event) -> bytes | None:
         """The first good answer; None when there was none (an empty reply list is how Zenoh says that nobody is there)."""
-        deadline_s = time.monotonic() + timeout_s
-        while not stopping.is_set() and time.monotonic() < deadline_s:
+        started_s = time.monotonic()
+        while not stopping.is_set() and (waited_s := time.monotonic() - started_s) < timeout_s:
+            if waited_s >= again_s and self._asked == 1 and self._ask(self):
+                self._asked = 2
             try:
                 reply = self._arrived.get(timeout=0.2)
             except queue.Empty:
                 continue
             if reply is None:
-                return None
-            if reply.ok is not None and len(reply.ok.payload) <= MAX_PAYLOAD_BYTES:
+                self._ended += 1
+                if self._ended == self._asked:
+                    return None
+            elif reply.ok is not None and len(reply.ok.payload) <= MAX_PAYLOAD_BYTES:
                 return bytes(reply.ok.payload.to_bytes())
         return None
 
@@ -91,6 +99,7 @@ class Exchange:
         self._answer, self._subscribe, self._serve = answer, tuple(subscribe), serve
         self._queries: queue.Queue[Any] = queue.Queue(maxsize=MAX_QUERIES_WAITING)
         self._session: Any = None
+        self._answer_took_s = 0.0  # the last one: a slow link is not asked twice
         self._swap = threading.Lock()  # opening and closing only
         self._answering = threading.Thread(target=self._answer_queries, name="answers", daemon=True)
 
@@ -235,10 +244,14 @@ class Exchange:
     # Asking.
 
     def ask(self, key: str, priority: str = "DATA") -> Pending | None:
-        """Query one register; None when the session is closed.  Never waits: `Pending.wait` does."""
-        session, pending = self._session, Pending()
+        """Query one register; None when the session is closed.  Never waits: `receive` does."""
+        pending = Pending(lambda pending: self._get(key, priority, pending))
+        return pending if self._get(key, priority, pending) else None
+
+    def _get(self, key: str, priority: str, pending: Pending) -> bool:
+        session = self._session
         if session is None:
-            return None
+            return False
         try:
             session.get(
                 key,
@@ -250,15 +263,17 @@ class Exchange:
             )
         except zenoh.ZError as error:
             log.debug("ask %s: %s", key, error)
-            return None
-        return pending
+            return False
+        return True
 
     def receive(self, pending: Pending | None) -> bytes | None:
         """Wait for an answer; None when none came."""
-        content = None if pending is None else pending.wait(QUERY_TIMEOUT_S + 1.0, self.closed)
+        started_s, again_s = time.monotonic(), max(ASK_AGAIN_S, SLOW_FACTOR * self._answer_took_s)
+        content = None if pending is None else pending.wait(QUERY_TIMEOUT_S + 1.0, again_s, self.closed)
         if content is None:
             self.traffic.unanswered += 1
             return None
+        self._answer_took_s = time.monotonic() - started_s
         self.traffic.pulled_bytes += len(content)
         return content
 

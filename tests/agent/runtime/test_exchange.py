@@ -63,6 +63,22 @@ def test_nobody_there_is_none_and_not_an_error(hub: Exchange) -> None:
         assert leaf.traffic.unanswered == 1
 
 
+def test_a_question_that_stays_silent_is_asked_once_more() -> None:
+    """The hub is deaf to the first question, as if its link had been dead just then."""
+    heard: list[str] = []
+
+    def answer(key: str) -> bytes | None:
+        heard.append(key)
+        return key.encode() if len(heard) > 1 else None
+
+    with Exchange(NetworkSettings("deaf"), answer, serve="t/deaf/**") as deaf, dial(deaf) as leaf:
+        until(leaf.links)
+        pending = leaf.ask("t/deaf/x")
+        assert pending is not None
+        assert pending.wait(5.0, 0.0, threading.Event()) == b"t/deaf/x"
+    assert heard == ["t/deaf/x", "t/deaf/x"]
+
+
 def test_only_the_newest_unread_message_of_a_key_waits(hub: Exchange) -> None:
     with dial(hub) as leaf:
         until(lambda: leaf.put("t/leaf/beat", b"first") and len(hub.inbox))
