@@ -12,13 +12,14 @@ import argparse
 import json
 import math
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.mapping.estimate import MapperStatus
+from agent.mapping.estimate import MapperStatus, ScanOutcome
 from agent.mapping.mapper import Mapper
 from agent.mapping.options import MappingOptions
 from hw.readings import LaserScan, Odometry
@@ -59,49 +60,71 @@ class Wheels:
         return Odometry(stamp_s, self.x_m, self.y_m, self.theta_rad)
 
 
-def scan(robot: SimulatedRobot, stamp_s: float, rng: np.random.Generator) -> LaserScan:
+def scan(robot: SimulatedRobot, stamp_s: float, rng: np.random.Generator, beams: int, scan_hz: float) -> LaserScan:
     """One revolution, each beam from where the robot was at its moment."""
-    angles = np.arange(BEAMS) * (math.tau / BEAMS)
-    offsets = np.arange(BEAMS) / (BEAMS * SCAN_HZ)
+    angles = np.arange(beams) * (math.tau / beams)
+    offsets = np.arange(beams) / (beams * scan_hz)
     poses = robot.poses_at(stamp_s + offsets)
     ranges, _ = cast(robot.world.segments, poses[:, :2], poses[:, 2] + angles, MAX_RANGE_M)
-    ranges = (ranges + rng.normal(0.0, NOISE_M, BEAMS)).astype(np.float32)
+    ranges = (ranges + rng.normal(0.0, NOISE_M, beams)).astype(np.float32)
     return LaserScan(
         stamp_s,
         ranges,
         angles.astype(np.float32),
         0.05,
         MAX_RANGE_M + 1.0,
-        duration_s=1.0 / SCAN_HZ,
+        duration_s=1.0 / scan_hz,
         time_offsets_s=offsets.astype(np.float32),
     )
 
 
-def run(name: str, seed: int, minutes: float, options: MappingOptions) -> dict[str, object]:
-    world = open_world(f"{name}?seed={seed}" if name in ("office", "random", "outdoor") else name)
+@dataclass(frozen=True, slots=True)
+class Revolution:
+    """What a robot hands on in one turn of its LIDAR, and the truth in the middle of it."""
+
+    odometry: list[Odometry]  # up to the end of the turn
+    scan: LaserScan
+    T_world_robot: SE2
+
+
+def world_of(name: str, seed: int) -> World:
+    return open_world(f"{name}?seed={seed}" if name in ("office", "random", "outdoor") else name)
+
+
+def explore(world: World, seed: int, minutes: float, beams: int = BEAMS, scan_hz: float = SCAN_HZ) -> Iterator[Revolution]:
+    """A robot explores a world by itself; seeded."""
     robot = SimulatedRobot(world, world.start_poses(1, seed)[0], seed)
-    wheels, rng = Wheels(robot), np.random.default_rng([3, seed])
-    mapper = Mapper(options, seed)
-    errors, cpu_s, held, odometry_s = [], 0.0, 0, 0.0
+    wheels, rng, odometry_s = Wheels(robot), np.random.default_rng([3, seed]), 0.0
     robot.poses_at(np.array([0.0]))
     robot.begin()
-    T_world_map = None
-    for k in range(int(minutes * 60 * SCAN_HZ)):
-        stamp_s = 0.1 + k / SCAN_HZ
-        revolution = scan(robot, stamp_s, rng)
+    for k in range(int(minutes * 60 * scan_hz)):
+        stamp_s = 0.1 + k / scan_hz
+        revolution = scan(robot, stamp_s, rng, beams, scan_hz)
         samples = []
-        while odometry_s <= stamp_s + 1.0 / SCAN_HZ:
+        while odometry_s <= stamp_s + 1.0 / scan_hz:
             samples.append(wheels.sample(odometry_s))
             odometry_s += 1.0 / ODOMETRY_HZ
-        started = time.process_time()
-        for sample in samples:
-            mapper.add_odometry(sample)
-        outcome = mapper.add_scan(revolution)
-        cpu_s += time.process_time() - started
+        yield Revolution(samples, revolution, robot.pose_at(stamp_s + 0.5 / scan_hz))
+
+
+def feed(mapper: Mapper, revolution: Revolution) -> tuple[ScanOutcome, float]:
+    """One turn into the filter; what came of it and the CPU seconds it took."""
+    started = time.process_time()
+    for sample in revolution.odometry:
+        mapper.add_odometry(sample)
+    outcome = mapper.add_scan(revolution.scan)
+    return outcome, time.process_time() - started
+
+
+def run(name: str, seed: int, minutes: float, options: MappingOptions) -> dict[str, object]:
+    world, mapper = world_of(name, seed), Mapper(options, seed)
+    errors, cpu_s, held, T_world_map = [], 0.0, 0, None
+    for revolution in explore(world, seed, minutes):
+        outcome, spent_s = feed(mapper, revolution)
+        cpu_s += spent_s
         held += outcome.status in (MapperStatus.LOST, MapperStatus.BLIND, MapperStatus.STUCK)
-        true = robot.pose_at(stamp_s + 0.5 / SCAN_HZ)
-        T_world_map = T_world_map or true
-        error = (T_world_map @ outcome.T_map_robot).inverse() @ true
+        T_world_map = T_world_map or revolution.T_world_robot
+        error = (T_world_map @ outcome.T_map_robot).inverse() @ revolution.T_world_robot
         errors.append((math.hypot(error.x_m, error.y_m), math.degrees(abs(error.theta_rad))))
     assert T_world_map is not None
     estimate = mapper.estimate()
