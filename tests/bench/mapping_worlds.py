@@ -28,6 +28,7 @@ from hw.sim.robot import SimulatedRobot
 from hw.sim.world import World, open_world
 from protocol.geometry import SE2
 from protocol.grid import FREE, OCCUPIED, OccupancyGrid
+from tests.bench.tables import markdown
 
 BEAMS = 360
 SCAN_HZ, ODOMETRY_HZ = 10.0, 50.0
@@ -196,10 +197,7 @@ def main() -> None:
     if arguments.json:
         print(json.dumps(rows))
         return
-    print("| " + " | ".join(rows[0]) + " |")
-    print("|" + " --- |" * len(rows[0]))
-    for row in rows:
-        print("| " + " | ".join(str(value) for value in row.values()) + " |")
+    print(markdown(rows))
 
 
 if __name__ == "__main__":
