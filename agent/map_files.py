@@ -15,7 +15,7 @@ guilty until proven: its size is read from the header before anything is decoded
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -54,14 +54,14 @@ class MapSettings:
 
 
 def load_map(path: str | Path) -> OccupancyGrid:
-    """The grid that nav2's map_server would serve, trinary."""
+    """The grid that nav2's map_server would serve, trinary; unknown stays unknown in files of nav2's map_saver too."""
     yaml_path = Path(path)
     settings = read_settings(yaml_path)
     try:
         pixels = load_image(yaml_path.parent / settings.image)
     except ImageFileError as error:
         raise MapFileError(f"{yaml_path}: {error}") from error
-    cells = cells_of(pixels, settings)
+    cells = cells_of(pixels, as_saved(pixels, settings))
     return OccupancyGrid(np.ascontiguousarray(cells[::-1]), settings.resolution_m, settings.origin)
 
 
@@ -104,6 +104,19 @@ def read_settings(path: Path) -> MapSettings:
         raise MapFileError(f"{path}: {error.strerror or error}") from error
     except (UnicodeDecodeError, FlatYamlError) as error:
         raise MapFileError(f"{path}: no map YAML: {error}") from error
+
+
+def as_saved(pixels: Pixels, settings: MapSettings) -> MapSettings:
+    """The thresholds that the writer meant.
+
+    nav2's map_saver draws unknown as 205 and wrote free_thresh 0.25 beside it until 2025 (navigation2 pull request 5278): by that
+    all it did not know is free.  Its three shades give it away.
+    """
+    is_its_own = settings.mode == "trinary" and not settings.negate and pixels.ndim == 2 and pixels.dtype == np.uint8
+    if not is_its_own or settings.free_thresh <= FREE_THRESH:
+        return settings
+    shades = set(np.flatnonzero(np.bincount(pixels.ravel(), minlength=256)).tolist())
+    return replace(settings, free_thresh=FREE_THRESH) if shades <= {OCCUPIED_SHADE, UNKNOWN_SHADE, FREE_SHADE} else settings
 
 
 def cells_of(pixels: Pixels, settings: MapSettings) -> NDArray[np.int8]:

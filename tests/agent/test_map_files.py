@@ -85,6 +85,43 @@ def test_a_widespread_threshold_of_a_quarter_would_read_unknown_as_free() -> Non
     assert cells_of(pixel, MapSettings("", 0.05, SE2.identity()))[0, 0] == UNKNOWN
 
 
+WRITERS = {  # header of the image, YAML: as these programs write them, to the letter
+    "nav2 map_saver, slam_toolbox": (
+        "P5\n3 2\n255\n",
+        "image: map.pgm\nmode: trinary\nresolution: 0.05\norigin: [-1.5, 2.25, 0]\nnegate: 0\noccupied_thresh: 0.65\n"
+        "free_thresh: 0.25",
+    ),
+    "map_saver of ROS 1": (
+        "P5\n# CREATOR: map_saver.cpp 0.050 m/pix\n3 2\n255\n",
+        "image: map.pgm\nresolution: 0.050000\norigin: [-1.500000, 2.250000, 0.000000]\nnegate: 0\noccupied_thresh: 0.65\n"
+        "free_thresh: 0.196\n\n",
+    ),
+    "Cartographer": (
+        "P5\n# Cartographer map; 0.05 m/pixel\n3 2\n255\n",
+        "image: map.pgm\nresolution: 0.05\norigin: [-1.5, 2.25, 0.0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n",
+    ),
+    "edited by hand on Windows": (
+        "P5 3 2 255\n",
+        "image: map.pgm   \r\nmode:   trinary\t\r\nresolution: .05 # m\r\norigin: [ -1.5, 2.25 , 0. ]  \r\nnegate: 0\r\n"
+        "occupied_thresh: 0.65\r\nfree_thresh: 0.196  \r\n   \r\n",
+    ),
+}
+
+
+@pytest.mark.parametrize("writer", WRITERS)
+def test_unknown_stays_unknown_in_files_as_others_write_them(writer: str, tmp_path: Path) -> None:
+    header, yaml = WRITERS[writer]
+    unknown = 128 if writer == "Cartographer" else 205
+    grid = load_map(written(tmp_path, yaml, header.encode() + bytes([0, unknown, 254, 254, 254, unknown])))
+    assert grid.cells.tolist() == [[FREE, FREE, UNKNOWN], [OCCUPIED, UNKNOWN, FREE]]
+    assert (grid.origin, grid.resolution_m) == (SE2(-1.5, 2.25, 0.0), 0.05)
+
+
+def test_another_gray_beside_it_makes_the_wide_threshold_meant(tmp_path: Path) -> None:
+    yaml = written(tmp_path, WRITERS["nav2 map_saver, slam_toolbox"][1], b"P5 3 1 255\n" + bytes([0, 205, 200]))
+    assert load_map(yaml).cells.tolist() == [[OCCUPIED, FREE, FREE]]
+
+
 def test_images_of_every_depth_read_the_same(tmp_path: Path) -> None:
     shades = np.array([[0, 205, 254], [254, 0, 205]], np.uint8)
     gray16 = shades.astype(np.uint16) * 257
