@@ -29,12 +29,12 @@ def line_sum(text: bytes) -> int:
     return (sum(text) & 0x3F) + 0x30
 
 
-def is_line_good(line: bytes) -> bool:
-    """Is the last character the sum of the others?  A `;` before it counts or not: both are met."""
+def is_line_good(line: bytes, is_text: bool = True) -> bool:
+    """Is the last character the sum of the others?  A `;` before it, at the end of a text, counts or not: both are met."""
     if len(line) < 2:
         return False
     body = line[:-1]
-    return line_sum(body) == line[-1] or (body[-1:] == b";" and line_sum(body[:-1]) == line[-1])
+    return line_sum(body) == line[-1] or (is_text and body[-1:] == b";" and line_sum(body[:-1]) == line[-1])
 
 
 def encode_value(value: int, characters: int) -> bytes:
@@ -58,12 +58,13 @@ def decode_values(text: bytes, characters: int) -> NDArray[np.int64]:
     return values
 
 
-def encode_message(echo: bytes, status: bytes = b"00", lines: Sequence[bytes] = ()) -> bytes:
-    """An answer of the sensor: the echo, the status, lines with their sums."""
+def encode_message(echo: bytes, status: bytes = b"00", texts: Sequence[bytes] = (), blocks: Sequence[bytes] = ()) -> bytes:
+    """An answer of the sensor: the echo, the status, lines of text or of characters of 6 bits, with their sums."""
     out = bytearray(echo + b"\n" + status + bytes((line_sum(status),)) + b"\n")
-    for line in lines:
-        body = line[:-1] if line.endswith(b";") else line  # the vendor's own sums leave the ; out
-        out += line + bytes((line_sum(body),)) + b"\n"
+    for text in texts:
+        out += text + bytes((line_sum(text.removesuffix(b";")),)) + b"\n"  # the vendor's own sums leave the ; out
+    for block in blocks:
+        out += block + bytes((line_sum(block),)) + b"\n"  # here a ; is a number
     return bytes(out + b"\n")
 
 
@@ -75,7 +76,7 @@ def encode_scan(echo: bytes, clock_ms: int, distances_mm: Sequence[int], intensi
     else:
         data = b"".join(encode_value(mm, 3) + encode_value(i, 3) for mm, i in zip(distances_mm, intensities, strict=True))
     blocks = [data[at : at + BLOCK_BYTES] for at in range(0, len(data), BLOCK_BYTES)]
-    return encode_message(echo, b"99" if echo[:1] == b"M" else b"00", [encode_value(clock_ms, 4), *blocks])
+    return encode_message(echo, b"99" if echo[:1] == b"M" else b"00", blocks=[encode_value(clock_ms, 4), *blocks])
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +93,8 @@ def decode_message(block: bytes) -> Message | None:
     lines = block.split(b"\n")
     if len(lines) < 2 or not 2 <= len(lines[0]) <= 40 or len(lines[1]) != 3 or not is_line_good(lines[1]):
         return None
-    if not all(is_line_good(line) for line in lines[2:]):
+    is_text = SCAN_ECHO.match(lines[0]) is None
+    if not all(is_line_good(line, is_text) for line in lines[2:]):
         return None
     return Message(lines[0], lines[1][:2], tuple(line[:-1] for line in lines[2:]))
 

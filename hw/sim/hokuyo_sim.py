@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -29,6 +30,7 @@ class HokuyoSim:
         self._echo = b""  # of the running stream
         self._left: int | None = None  # scans still to send; None: for ever
         self._skip = self._skipped = 0
+        self._begun_s = 0.0
         self._once: list[bytes] = []  # GD requests waiting for the next sweep
         self._is_laser_on = False
         self._is_timing = False
@@ -53,19 +55,19 @@ class HokuyoSim:
             if line:
                 self._obey(line, now_s)
 
-    def _say(self, line: bytes, status: bytes = b"00", lines: list[bytes] | None = None) -> None:
-        self._outbox += scip.encode_message(line, status, lines or [])
+    def _say(self, line: bytes, status: bytes = b"00", texts: Sequence[bytes] = (), blocks: Sequence[bytes] = ()) -> None:
+        self._outbox += scip.encode_message(line, status, texts, blocks)
 
     def _obey(self, line: bytes, now_s: float) -> None:
         command = line.partition(b";")[0]
         if match := _SCAN.match(command):
             self._scan(line, match, now_s)
         elif command == b"PP":
-            self._say(line, lines=self.parameters.lines())
+            self._say(line, texts=self.parameters.lines())
         elif command == b"VV":
-            self._say(line, lines=_version())
+            self._say(line, texts=_version())
         elif command == b"II":
-            self._say(line, lines=self._state(now_s))
+            self._say(line, texts=self._state(now_s))
         elif command == b"BM":
             self._laser_on(line, now_s)
         elif command in (b"QT", b"RS", b"RT"):
@@ -76,7 +78,7 @@ class HokuyoSim:
         elif command in (b"TM0", b"TM1", b"TM2"):
             self._time(line, command, now_s)
         elif command == b"%ST":
-            self._say(line, lines=[b"%03d" % self._status(now_s)])
+            self._say(line, blocks=[b"%03d" % self._status(now_s)])
         elif command.startswith(b"SS"):
             self._set_rate(line, command[2:])
         elif command in (b"SCIP2.0", b"HS0", b"HS1") or re.match(rb"CR\d\d$", command):
@@ -108,7 +110,7 @@ class HokuyoSim:
         if refusal is None:
             self._is_timing = command != b"TM2"
         is_asked = command == b"TM1" and refusal is None
-        self._say(line, refusal or b"00", [scip.encode_value(self._clock_ms(now_s), 4)] if is_asked else [])
+        self._say(line, refusal or b"00", blocks=[scip.encode_value(self._clock_ms(now_s), 4)] if is_asked else [])
 
     def _set_rate(self, line: bytes, digits: bytes) -> None:
         rate = int(digits) if digits.isdigit() and len(digits) == 6 else 0
@@ -145,6 +147,7 @@ class HokuyoSim:
             count = int(match[7])
             self._echo, self._left = line, count or None
             self._skip, self._skipped, self._is_laser_on = int(match[6]), 0, True
+            self._begun_s = now_s  # the sweep that is under way is not sent
 
     def emit(self, now_s: float) -> bytes:
         """See `ByteDevice`; a new bit rate holds from behind the answer that grants it."""
@@ -156,7 +159,7 @@ class HokuyoSim:
             if self._once and self._is_laser_on:
                 out += b"".join(self._message(line, sweep, None) for line in self._once)
                 self._once.clear()
-            if self._echo and self._is_due():
+            if self._echo and sweep.times_s[0] >= self._begun_s and self._is_due():
                 out += self._message(self._echo, sweep, self._left)
                 if self._left == 0:
                     self._echo = b""

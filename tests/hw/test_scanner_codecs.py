@@ -103,6 +103,13 @@ def test_hokuyo_sums_with_and_without_the_semicolon_are_both_read() -> None:
     assert not scip.is_line_good(b"DMIN:21;4")
 
 
+def test_a_hokuyo_block_that_ends_in_a_semicolon_has_the_sum_of_all_its_characters() -> None:
+    clock_ms = scip.decode_value(b"a<l;")
+    line = scip.encode_scan(b"GD0000000101", clock_ms, [1, 2]).split(b"\n")[2]
+    assert line == b"a<l;" + bytes((scip.line_sum(b"a<l;"),))
+    assert not scip.is_line_good(b"a<l;" + bytes((scip.line_sum(b"a<l"),)), is_text=False)
+
+
 @pytest.mark.parametrize("n", sick_lms.FIELDS)
 def test_sick_scans_of_every_field(n: int) -> None:
     telegram = sick_lms.scan_telegram([500 + k % 300 for k in range(n)])
