@@ -20,6 +20,7 @@ PHASES = 4  # a stamp is centred on a quarter of a cell: whole cells blur the fi
 EXPLAINED = (
     215  # an end point on a cell at least this bright (3.5 cm from a drawn one) is not drawn: it would only widen the wall
 )
+STAMPED_AT_ONCE = 2048  # end points: the first scan of 30 particles at one stroke takes 35 MB for a moment
 MARGIN_TILES = 8  # tables grow by this much more than asked, so that they seldom grow
 
 Ints = NDArray[np.int64]
@@ -99,13 +100,21 @@ class TiledFields:
         is_new = self.pool.ravel().take(here) < EXPLAINED
         row, col, base = row[is_new], col[is_new], base[is_new]
         self._own_tiles(base, row, col)
+        phase = (row_phase * PHASES + col_phase)[is_new]
+        for first in range(0, len(row), STAMPED_AT_ONCE):
+            some = slice(first, first + STAMPED_AT_ONCE)
+            self._stamp_kernels(base[some], row[some], col[some], phase[some])
+
+    def _stamp_kernels(self, base: Ints, row: Ints, col: Ints, phase: Ints) -> None:
+        """Draw the kernels of (K,) end points into tiles that their particles own."""
+        width = self.tables.shape[2]
         offsets = np.arange(-RADIUS, RADIUS + 1)
         rows = row[:, None] + offsets  # (K, 7)
         cols = col[:, None] + offsets
         places = (base[:, None] + (rows >> SHIFT) * width)[:, :, None] + (cols >> SHIFT)[:, None, :]
         cells = self.tables.ravel().take(places) << (2 * SHIFT)
         cells += ((rows & (TILE - 1)) << SHIFT)[:, :, None] + (cols & (TILE - 1))[:, None, :]
-        values = self.kernels.take((row_phase * PHASES + col_phase)[is_new], axis=0)
+        values = self.kernels.take(phase, axis=0)
         put_max(self.pool.ravel(), cells.ravel(), values.ravel())
 
     def _phase(self, along_m: Floats, axis: int) -> tuple[Ints, Ints]:

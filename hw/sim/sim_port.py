@@ -111,7 +111,8 @@ def client_baud(master: int) -> int:
 class PtyServer:
     """A thread that keeps lines moving.  Use it in a `with`."""
 
-    def __init__(self, lines: Iterable[tuple[ByteDevice, Path]], name: str = "simulated devices") -> None:
+    def __init__(self, lines: Iterable[tuple[ByteDevice, Path]], name: str = "simulated devices", tick_s: float = TICK_S) -> None:
+        self._tick_s = tick_s
         self._lines = [PtyLine(device, link) for device, link in lines]
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
@@ -127,7 +128,7 @@ class PtyServer:
             line.close()
 
     def _run(self) -> None:
-        while not self._stop.wait(TICK_S):
+        while not self._stop.wait(self._tick_s):
             for line in self._lines:
                 line.pump(time.monotonic())
 
