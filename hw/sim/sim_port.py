@@ -51,8 +51,14 @@ class PtyLine:
     def __init__(self, device: ByteDevice, link: Path) -> None:
         self.device, self.link = device, link
         self._master = -1
+        self._is_open = False  # by a client, at the last look
         self._poll = select.poll()
         self.plug()
+
+    @property
+    def heard(self) -> list[int]:
+        """What to wait on for a client's words; nothing while there is no client."""
+        return [self._master] if self._is_open and self._master >= 0 else []
 
     def plug(self) -> None:
         """The port appears, under whatever name the system gives it."""
@@ -86,7 +92,7 @@ class PtyLine:
         if self._master < 0:
             self.plug()
         events = dict(self._poll.poll(0)).get(self._master, 0)
-        is_open = not events & select.POLLHUP
+        is_open = self._is_open = not events & select.POLLHUP
         is_right_rate = not is_open or self.device.baud in (0, client_baud(self._master))
         if events & select.POLLIN:
             with contextlib.suppress(OSError):
@@ -128,9 +134,18 @@ class PtyServer:
             line.close()
 
     def _run(self) -> None:
-        while not self._stop.wait(self._tick_s):
+        while not self._stop.is_set():
+            self._wait()
             for line in self._lines:
                 line.pump(time.monotonic())
+
+    def _wait(self) -> None:
+        """For a tick, or until a client says something."""
+        heard = [fd for line in self._lines for fd in line.heard]
+        if heard:
+            select.select(heard, [], [], self._tick_s)
+        else:
+            self._stop.wait(self._tick_s)
 
 
 class SimPort:
