@@ -41,6 +41,7 @@ SECONDS = 25.0
 Rows = list[list[float]]  # of a LIDAR [degrees counter-clockwise, metres], of a base [seconds, left ticks, right ticks]
 FOREIGN = Path(__file__).parents[1] / "harness" / "foreign_clients.py"
 ROBOT_SEED = 3
+BEGUN_BEFORE_S = 12.0  # a client has begun to read so long after the robot was started
 
 # Not here: lds2d reads an LDS-01 one degree off the maker's own ROS driver, which we follow; adafruit's express scan sends a
 # request without its operands, which no RPLIDAR understands; pyrplidar reads dense capsules with their bytes swapped.
@@ -186,7 +187,7 @@ def measured(python: str, client: str, device: str, mode: str, baud: int, option
 def serving(folder: Path, device: str, options: list[str]) -> Iterator[None]:
     """`mapquilt sim`, as a person starts it."""
     (folder / "room.txt").write_text("\n".join(" ".join(map(str, wall)) for wall in ROOM.segments.reshape(-1, 4).tolist()))
-    command = [sys.executable, "-m", "agent.cli", "-q", "sim", device, "--link", str(folder / "port"), "--noise", "0", *options]
+    command = [sys.executable, "-m", "agent", "-q", "sim", device, "--link", str(folder / "port"), "--noise", "0", *options]
     program = subprocess.Popen(command, cwd=folder, env={**os.environ, "PYTHONPATH": str(FOREIGN.parents[2])})
     try:
         until((folder / "port").exists, 20.0, "the port")
@@ -252,7 +253,7 @@ def way_errors_m(device: str, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
     ticks = np.cumsum((np.diff(read[:, 1:], axis=0) + 2 ** (bits - 1)) % 2**bits - 2 ** (bits - 1), axis=0)
     read_m = ticks * math.tau * drive.wheel_radius_m / drive.ticks_per_revolution
     later = np.round((read[1:, 0] - read[0, 0]) / step_s).astype(int)
-    begins = np.arange(len(clock_s) - later[-1])
+    begins = np.arange(round(BEGUN_BEFORE_S / step_s))
 
     def best(ways_m: np.ndarray) -> np.ndarray:
         true_m = ways_m[begins[:, None] + later] - ways_m[begins, None]

@@ -155,11 +155,11 @@ def relay(server: socket.socket, line: serial.Serial) -> None:
 
 
 def ticks(read: Callable[[], list[float]]) -> Rows:
-    """Twenty readings of both counters, a twentieth of a second apart, each with its time."""
+    """Readings of both counters over a few seconds, each with its time."""
     rows = []
-    for _ in range(20):
+    for _ in range(60):
         rows.append([time.time(), *read()])
-        time.sleep(0.05)
+        time.sleep(0.08)
     return rows
 
 
