@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 import queue
 import threading
-import time
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -20,6 +19,7 @@ from agent.runtime.guard import Guard, OpenGuard
 from agent.runtime.latest import Latest
 from agent.runtime.merge_worker import Done, Matched, MergeWorker
 from agent.runtime.network import NetworkSettings
+from agent.runtime.pace import REAL, Pace
 from agent.runtime.pulling import Pull
 from protocol.channels import BY_KIND, parse_key, push_register, robot_key, subscriptions
 from protocol.codec import decode, encode
@@ -32,7 +32,7 @@ from protocol.messages import GlobalMap, Message
 log = logging.getLogger(__name__)
 
 TICK_S = 0.1
-WAIT_S = 0.05
+WAIT_S, PULL_WAIT_S = 0.05, 0.25
 MAX_PEER_MAPS = 32
 BULK_PULLERS, SMALL_PULLERS = 2, 3  # a silent peer holds one up for 5 s; the others go on
 
@@ -47,9 +47,11 @@ class FleetWorker:
         merger: MergeWorker,
         guard: Guard | None = None,
         on_note: Callable[[Note], None] | None = None,
+        pace: Pace = REAL,
+        exchange: Callable[..., Exchange] = Exchange,
     ) -> None:
-        self.settings = settings
-        self.exchange = Exchange(
+        self.settings, self._pace = settings, pace
+        self.exchange = exchange(
             settings, self._register, subscriptions(settings.fleet), robot_key(settings.fleet, settings.robot, "**")
         )
         self.local_maps: Latest[tuple[LocalMap, FeatureMap]] = Latest()
@@ -69,7 +71,7 @@ class FleetWorker:
 
     def step(self) -> None:
         """One message, whatever results wait, our own map when it changed, and the tick when it is time."""
-        taken = self.exchange.inbox.take(WAIT_S)
+        taken = self.exchange.inbox.take(self._pace.wait_s(WAIT_S))
         if taken is not None:
             self._on_bytes(*taken)
         while not self._results.empty():
@@ -80,10 +82,14 @@ class FleetWorker:
         pose = self.poses.take()
         if pose is not None:
             with self._turn:
-                self._coordinator.on_pose(pose, time.monotonic())
-        if time.monotonic() >= self._next_tick_s:
-            self._next_tick_s = time.monotonic() + TICK_S
+                self._coordinator.on_pose(pose, self._pace.clock())
+        if self._pace.clock() >= self._next_tick_s:
+            self._next_tick_s = self._pace.clock() + TICK_S
             self._do(self._coordinator.tick)
+
+    def waiting(self) -> int:
+        """Words, results and fetches that nobody has looked at yet."""
+        return len(self.exchange.inbox) + self._results.qsize() + self._small.qsize() + self._bulk.qsize()
 
     def small_step(self) -> None:
         self._pull_from(self._small)
@@ -93,7 +99,7 @@ class FleetWorker:
 
     def _pull_from(self, fetches: queue.Queue[Fetch]) -> None:
         try:
-            fetch = fetches.get(timeout=0.25)
+            fetch = fetches.get(timeout=self._pace.wait_s(PULL_WAIT_S))
         except queue.Empty:
             return
         message: Message | None = None
@@ -154,7 +160,7 @@ class FleetWorker:
 
     def _do(self, call: Callable[[float], Iterable[Effect]]) -> None:
         with self._turn:
-            effects = list(call(time.monotonic()))
+            effects = list(call(self._pace.clock()))
         for effect in effects:
             self._carry_out(effect)
 
@@ -203,7 +209,7 @@ class FleetWorker:
 
     def state(self) -> FleetState:
         with self._turn:
-            return self._coordinator.state(time.monotonic())
+            return self._coordinator.state(self._pace.clock())
 
     def order(self, verb: str, peer: str) -> None:
         """`unmerge` or `readmit` a peer, as the operator wishes."""

@@ -13,6 +13,7 @@ from dataclasses import replace
 from agent.mapping.estimate import MapEstimate
 from agent.mapping.mapper import Mapper
 from agent.runtime.latest import Latest
+from agent.runtime.pace import REAL, Pace
 from agent.runtime.sensing import Readings
 
 WAIT_S = 0.25
@@ -23,19 +24,21 @@ ESTIMATE_PERIOD_S = 1.0  # an estimate copies the whole grid; peers and the page
 class MapWorker:
     """Owns the mapper.  Others ask through `call`, and are served between two scans."""
 
-    def __init__(self, mapper: Mapper, readings: Readings, estimate_period_s: float = ESTIMATE_PERIOD_S) -> None:
+    def __init__(
+        self, mapper: Mapper, readings: Readings, estimate_period_s: float = ESTIMATE_PERIOD_S, pace: Pace = REAL
+    ) -> None:
         self.mapper = mapper
         self.estimates: Latest[MapEstimate] = Latest()  # for the snapshot worker
         self.newest: MapEstimate | None = None  # for whoever looks; replaced as a whole
         self.is_paused = False
         self.scans = 0
         self.scan_cpu_s = 0.0  # CPU of this thread spent on scans
-        self._readings = readings
+        self._readings, self._pace = readings, pace
         self._period_s = estimate_period_s
         self._next_estimate_s = 0.0
         # A map saved before this computer was started again bears later stamps than its clock now gives.
         saved_s = mapper.estimate().stamp_s
-        self._shift_s = saved_s + 1.0 - time.monotonic() if saved_s > time.monotonic() else 0.0
+        self._shift_s = saved_s + 1.0 - pace.clock() if saved_s > pace.clock() else 0.0
         self._calls: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
 
     def call(self, action: Callable[[], None]) -> None:
@@ -45,7 +48,7 @@ class MapWorker:
     def step(self) -> None:
         while not self._calls.empty():
             self._calls.get()()
-        odometry, scan = self._readings.take(WAIT_S, WAIT_FOR_ODOMETRY_S)
+        odometry, scan = self._readings.take(self._pace.wait_s(WAIT_S), self._pace.wait_s(WAIT_FOR_ODOMETRY_S))
         for sample in odometry:
             self.mapper.add_odometry(replace(sample, stamp_s=sample.stamp_s + self._shift_s) if self._shift_s else sample)
         if scan is None or self.is_paused:
@@ -54,7 +57,7 @@ class MapWorker:
         self.mapper.add_scan(replace(scan, stamp_s=scan.stamp_s + self._shift_s) if self._shift_s else scan)
         self.scan_cpu_s += time.thread_time() - started
         self.scans += 1
-        now = time.monotonic()
+        now = self._pace.clock()
         if now >= self._next_estimate_s:
             self._next_estimate_s = now + self._period_s
             self.publish()

@@ -18,6 +18,7 @@ from agent.fleet.effects import Fuse, Match, MatchKind
 from agent.merging.fusion import FusedMap, fuse
 from agent.merging.matching import match_maps, verify_match
 from agent.merging.result import MatchOptions, MergeResult
+from agent.runtime.pace import REAL, Pace
 from protocol.grid import OccupancyGrid
 
 MAX_JOBS = 64
@@ -50,8 +51,8 @@ OnDone = Callable[[Done], None]
 class MergeWorker:
     """Takes `Match` and `Fuse` jobs; each comes back through its `on_done`, finished or dropped."""
 
-    def __init__(self, options: MatchOptions) -> None:
-        self._options = options
+    def __init__(self, options: MatchOptions, pace: Pace = REAL) -> None:
+        self._options, self._pace = options, pace
         self._jobs: queue.PriorityQueue[tuple[int, int, Match | Fuse, OnDone]] = queue.PriorityQueue(maxsize=MAX_JOBS)
         self._order = itertools.count()
         self._snapshots: OrderedDict[bytes, MapSnapshot] = OrderedDict()
@@ -73,7 +74,7 @@ class MergeWorker:
 
     def step(self) -> None:
         try:
-            _, _, job, on_done = self._jobs.get(timeout=WAIT_S)
+            _, _, job, on_done = self._jobs.get(timeout=self._pace.wait_s(WAIT_S))
         except queue.Empty:
             return
         started = time.thread_time()

@@ -33,6 +33,7 @@ from agent.mapping.mapper import Mapper
 from agent.mapping.options import MappingOptions
 from agent.merging.result import MatchOptions
 from agent.runtime.control import ControlServer
+from agent.runtime.exchange import Exchange
 from agent.runtime.fleet_worker import FleetWorker
 from agent.runtime.guard import guard_for
 from agent.runtime.health import Health, Notifier, watchdog_period_s
@@ -40,6 +41,7 @@ from agent.runtime.keeper import Keeper
 from agent.runtime.map_worker import MapWorker
 from agent.runtime.merge_worker import MergeWorker
 from agent.runtime.network import NetworkSettings
+from agent.runtime.pace import REAL, Pace
 from agent.runtime.priors import FrozenPeer
 from agent.runtime.records import Records
 from agent.runtime.sensing import Readings, device_step
@@ -57,23 +59,35 @@ STOP_WITHIN_S = 1.5  # what the workers have to come back; the whole stop stays 
 class Node:
     """A running robot.  Use with `with`: leaving stops every thread and closes every device, whatever happened."""
 
-    def __init__(self, config: Config, state_folder: Path | None, control_socket: Path | None) -> None:
+    def __init__(
+        self,
+        config: Config,
+        state_folder: Path | None,
+        control_socket: Path | None,
+        *,
+        boot_id: int | None = None,
+        pace: Pace = REAL,
+        exchange: Callable[..., Exchange] = Exchange,
+    ) -> None:
         self.config = config
         self.robot = config.robot.id
-        self.boot_id = secrets.randbits(63)
+        self.boot_id = secrets.randbits(63) if boot_id is None else boot_id
+        self._pace = pace
         self.started_s = time.monotonic()
         self.state = StateDirectory(state_folder) if state_folder is not None else None
         self.records = Records(state_folder / "records.jsonl" if state_folder is not None else None)
         self.lidar: Source = open_lidar(config.lidar.url)
         self.wheels: Source | None = open_wheels(wheels_url(config)) if config.wheels.url else None
         self.readings = Readings()
-        self.map = MapWorker(self._mapper(), self.readings)
-        self.merger = MergeWorker(match_options(config))
+        self.map = MapWorker(self._mapper(), self.readings, pace=pace)
+        self.merger = MergeWorker(match_options(config), pace)
         options = FleetOptions(min_match_factor=config.matching.min_match_factor)
         coordinator = Coordinator(self.robot, self.boot_id, options)
         settings = network_settings(config)
         guard = guard_for(settings, self.boot_id)
-        self.fleet = FleetWorker(coordinator, settings, self.merger, guard, on_note=self.records.add)
+        self.fleet = FleetWorker(
+            coordinator, settings, self.merger, guard, on_note=self.records.add, pace=pace, exchange=exchange
+        )
         given = enumerate(map(Path, config.fleet.priors), start=1)
         self.priors = [FrozenPeer(path, number, settings, self.merger, options) for number, path in given]
         self.keeper = Keeper(self)
@@ -119,7 +133,7 @@ class Node:
         return Mapper(options, seed=self.config.mapping.seed)
 
     def _features_step(self) -> None:
-        estimate = self.map.estimates.take(0.25)
+        estimate = self.map.estimates.take(self._pace.wait_s(0.25))
         if estimate is None:
             return
         self.fleet.poses.put(estimate.T_map_robot)

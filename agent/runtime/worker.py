@@ -39,7 +39,7 @@ class Worker:
 
     def __init__(self, name: str, step: Callable[[], None], deadline_s: float, reads: str, writes: str) -> None:
         self.name, self.deadline_s, self.reads, self.writes = name, deadline_s, reads, writes
-        self._step = step
+        self.step = step
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._progress_s = time.monotonic()
@@ -68,7 +68,7 @@ class Worker:
     def _run(self) -> None:
         while not self._stop.is_set():
             try:
-                self._step()
+                self.step()
                 self._is_failing = False
             except Exception as error:
                 self._note(error)
