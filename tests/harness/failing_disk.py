@@ -10,9 +10,10 @@ Only the calls this house makes are replaced: those of `io.open`, of the files i
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -31,6 +32,7 @@ class FailingDisk:
         self.failed: list[str] = []  # what failed
         self._folder = os.fspath(folder)
         self._first, self._error, self._for_ever = 0, 0, False
+        self._is_watching = True
         self._patches: list[Any] = []
 
     def fail(self, number: int, error: int, *, for_ever: bool) -> None:
@@ -40,6 +42,13 @@ class FailingDisk:
     def heal(self) -> None:
         """Nothing fails any more."""
         self._first = 0
+
+    @contextlib.contextmanager
+    def unwatched(self) -> Iterator[None]:
+        """For looking at what is there."""
+        self._is_watching = False
+        yield
+        self._is_watching = True
 
     def __enter__(self) -> FailingDisk:
         replaced = {name: self._watched(name, getattr(os, name)) for name in CALLS}
@@ -54,6 +63,8 @@ class FailingDisk:
 
     def count(self, call: str) -> None:
         """One more call; it fails when its number is up."""
+        if not self._is_watching:
+            return
         self.calls += 1
         if self._first and (self.calls == self._first or (self._for_ever and self.calls > self._first)):
             self.failures += 1
