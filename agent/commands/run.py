@@ -14,7 +14,7 @@ import sys
 import threading
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 
@@ -29,8 +29,10 @@ from agent.runtime.log_setup import set_up_logging
 from agent.runtime.network import NetworkConfigError
 from agent.runtime.node import Node
 from agent.runtime.ros_bridge import MapSource, RosBridge
-from agent.view.server import ViewServer, ViewSource
 from hw.errors import DeviceConfigError
+
+if TYPE_CHECKING:
+    from agent.view.server import ViewServer, ViewSource
 
 log = logging.getLogger(__name__)
 
@@ -119,6 +121,8 @@ def running(node: Node) -> Any:
 
 def serve_page(source: ViewSource, config: Config) -> ViewServer | None:
     """The page on the wished port, or on the next free one; a robot without a page is still a robot."""
+    from agent.view.server import ViewServer  # noqa: PLC0415  a robot without a page need not carry 3 MB of HTTP
+
     wished = config.view.port
     for port in range(wished, wished + PORTS_TRIED) if wished else (0,):
         try:

@@ -25,6 +25,7 @@ from protocol.tiles import TileMap
 _KEPT_GLOBAL_MAPS = 6
 _FOLLOW_M, _FOLLOW_RAD = 0.4, 0.06  # how far a composer's layout may be from ours and still be followed
 _RECIPE_WAIT_S = 2.5
+_FUSING_SHARE = 4.0  # a pause of this many times what the last fusion took: large groups on slow machines compose less often
 _PATIENCE_S = 10.0  # without a usable recipe for this long, each makes its own
 
 MissingMap = tuple[str, bytes]  # (robot, digest) that a recipe needs
@@ -67,6 +68,7 @@ class Composition:
         self._made: _Recipe | None = None  # what `global_map` was made from
         self._running: tuple[int, _Recipe, float] | None = None
         self._composed_s = -1e9
+        self._fusing_took_s = 0.0
         self._grouped_s: float | None = None  # since when we are not alone
         self._followed_s: float | None = None  # since when there was a usable recipe, or we began to wait for one
         self._seq = 0
@@ -106,6 +108,7 @@ class Composition:
     def on_fused(self, job: Fuse, fused: Fused | None, now_s: float) -> None:
         if self._running is None or self._running[0] != job.id:
             return
+        self._fusing_took_s = now_s - self._running[2]
         recipe, self._running = self._running[1], None
         if fused is None or self._ledger.group is None:
             return
@@ -172,7 +175,8 @@ class Composition:
                     missing.append((robot, b""))
         if self._waits_for_recipes(group, now_s):
             return missing
-        if now_s - self._composed_s >= self._ledger.options.compose_period_s:
+        pause_s = max(self._ledger.options.compose_period_s, _FUSING_SHARE * self._fusing_took_s)
+        if now_s - self._composed_s >= pause_s:
             self._composed_s = now_s
             recipe = self._recipe(group, {robot: version for robot, version in versions.items() if version is not None})
             if recipe is not None and recipe != self._made:
