@@ -76,12 +76,13 @@ def _second(node: Node, folder: Path, second: int, first: int, disk: FailingDisk
 
 
 def _map_and_save(node: Node, second: int) -> bytes:
-    saved = node.map.mapper.checkpoint()
+    made: list[bytes] = []
     node.readings.put(scan(second))
     node.keeper.ask_for_checkpoint()
+    node.map.call(lambda: made.append(node.map.mapper.checkpoint()))
     node.map.step()
     node.keeper.save_checkpoint()
-    return saved
+    return made[0]
 
 
 def problems(node: Node) -> list[str]:
