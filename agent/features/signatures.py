@@ -20,6 +20,7 @@ RINGS_M = (0.6, 1.1, 1.7, 2.5, 3.5, 4.8)
 SECTORS = 24
 MAX_QUERIES, QUERY_SPACING_M = 400, 0.75
 MAX_TARGETS, TARGET_SPACING_M = 1600, 0.35
+MAX_DENSE_TARGETS = 6000  # all the walls of a 250 m campus: a small map may lie where nothing is telling
 _STRUCTURE_CELL_M = 1.5
 
 
@@ -38,12 +39,17 @@ class Signatures:
 
 
 def signatures_of(
-    walls: WallPoints, kinds: NDArray[np.uint8], distance_m: NDArray[np.float32], known: NDArray[np.bool_], resolution_m: float
+    walls: WallPoints,
+    kinds: NDArray[np.uint8],
+    distance_m: NDArray[np.float32],
+    known: NDArray[np.bool_],
+    resolution_m: float,
+    limit: int = MAX_TARGETS,
 ) -> Signatures:
     """Signatures of the firm wall points of one map."""
     firm = np.flatnonzero((kinds != LOOSE) & (walls.linearity > 0.3))
     firm = firm[np.argsort(-_structure(walls, firm), kind="stable")]
-    targets = firm[_spread(walls.positions_m[firm], TARGET_SPACING_M)[:MAX_TARGETS]]
+    targets = firm[_spread(walls.positions_m[firm], TARGET_SPACING_M)[:limit]]
     positions, angles = walls.positions_m[targets], walls.angles_rad[targets]
     values, seen = _sampled(positions, angles, distance_m, known, resolution_m)
     queries = _spread(positions, QUERY_SPACING_M)[:MAX_QUERIES]

@@ -18,7 +18,7 @@ from agent.features.extraction import feature_map
 from agent.features.field import UNKNOWN_BYTE, MatchField
 from agent.features.incremental import updated_walls
 from agent.features.lines import WallLines, wall_lines
-from agent.features.signatures import Signatures, signatures_of
+from agent.features.signatures import MAX_DENSE_TARGETS, MAX_TARGETS, Signatures, signatures_of
 from agent.features.structure import structure_kinds
 from agent.features.wall_points import WallPoints, wall_points
 from agent.features.working import WorkingGrid
@@ -102,10 +102,19 @@ class MapSnapshot:
 
     @cached_property
     def signatures(self) -> Signatures:
-        known = (self.field.fine != UNKNOWN_BYTE) | self.working.free.view(np.bool_)
-        return signatures_of(self.thin_walls, self.thin_kinds, self.field.distance_m, known, self.working.resolution_m)
+        """Of the most telling wall points."""
+        return self._signatures(MAX_TARGETS)
+
+    @cached_property
+    def dense_signatures(self) -> Signatures:
+        """Of all firm wall points, for a small map that may lie anywhere."""
+        return self._signatures(MAX_DENSE_TARGETS)
 
     @cached_property
     def features(self) -> FeatureMap:
         """What travels and what a person can read."""
         return feature_map(self.working, self.walls, self.lines, self.grid.origin)
+
+    def _signatures(self, limit: int) -> Signatures:
+        known = (self.field.fine != UNKNOWN_BYTE) | self.working.free.view(np.bool_)
+        return signatures_of(self.thin_walls, self.thin_kinds, self.field.distance_m, known, self.working.resolution_m, limit)

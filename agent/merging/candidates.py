@@ -20,12 +20,14 @@ MIN_COMMON_SAMPLES = 40
 MIN_LIKENESS = 0.3
 
 
-def signature_candidates(ours: Signatures, theirs: Signatures, rotations: NDArray[np.float64]) -> Poses:
+def signature_candidates(
+    ours: Signatures, theirs: Signatures, rotations: NDArray[np.float64], targets_per_query: int = TARGETS_PER_QUERY
+) -> Poses:
     """The best-matching places of ours for every telling place of theirs, turned to agree with the walls where near."""
     if not len(ours) or not len(theirs.queries):
         return no_poses()
     alike = _likeness(theirs, ours)
-    best = min(TARGETS_PER_QUERY, alike.shape[1])
+    best = min(targets_per_query, alike.shape[1])
     targets = np.argpartition(-alike, best - 1, axis=1)[:, :best].ravel()
     queries = np.repeat(np.arange(len(theirs.queries)), best)
     good = alike[queries, targets] > MIN_LIKENESS

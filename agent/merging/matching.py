@@ -32,10 +32,10 @@ def match_maps(ours: MapSnapshot, theirs: MapSnapshot, options: MatchOptions | N
     if not len(ours.thin_walls) or not len(theirs.thin_walls):
         return MergeResult.none(Reason.EMPTY)
     poses, tried = search(ours, theirs, FIRST_PASS)
-    result = _judged(ours, theirs, poses, tried, options)
+    result = judged(ours, theirs, poses, tried, options)
     if options.thorough and not result.accepted:
         more, also_tried = search(ours, theirs, SECOND_PASS)
-        result = _judged(ours, theirs, np.concatenate([poses, more]), tried + also_tried, options)
+        result = judged(ours, theirs, np.concatenate([poses, more]), tried + also_tried, options)
     return result
 
 
@@ -46,7 +46,7 @@ def verify_match(ours: MapSnapshot, theirs: MapSnapshot, T_ours_theirs: SE2, opt
         return MergeResult.none(Reason.EMPTY)
     T = ours.grid.origin.inverse() @ T_ours_theirs @ theirs.grid.origin
     pose = np.array([[T.x_m, T.y_m, T.theta_rad]])
-    return _judged(
+    return judged(
         ours,
         theirs,
         refined(side(ours, _POINTS), side(theirs, _POINTS), pose, FINE_GATES_M),
@@ -55,7 +55,7 @@ def verify_match(ours: MapSnapshot, theirs: MapSnapshot, T_ours_theirs: SE2, opt
     )
 
 
-def _judged(ours: MapSnapshot, theirs: MapSnapshot, poses: Poses, tried: int, options: MatchOptions) -> MergeResult:
+def judged(ours: MapSnapshot, theirs: MapSnapshot, poses: Poses, tried: int, options: MatchOptions) -> MergeResult:
     """The verdict on the best of the refined transforms."""
     if not len(poses):
         return MergeResult.none(Reason.NO_CANDIDATES)

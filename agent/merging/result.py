@@ -60,6 +60,11 @@ class MatchOptions:
     size_tolerance: float = 0.15  # paper: two features are "the same size" within this fraction
     rotation_bin_deg: float = 1.0  # paper: resolution of the rotation vote
     min_margin_m: float = 6.5  # metres of wall by which the best must beat the best distinct alternative; 8 costs 5 % of merges
+    min_agreeing_m: float = 8.0  # of firm wall
+    max_rival_share: float = 0.72  # of the best score
+    min_observability_m: float = 2.0  # of wall that fixes the worst-seen direction, and
+    min_observable_share: float = 0.1  # of agreeing wall: along a long corridor two metres of cross wall are an accident
+    unsuspicious: float = 0.5  # most true pairs look less like another place of the same kind; above it more margin is asked for
     mirror_test: bool = True  # try the reflection before merging: 40 ms a merge, and look-alikes in mirror image do not pass
     thorough: bool = True  # a second, slower pass when the first ends undecided
 

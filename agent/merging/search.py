@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.features.snapshot import MapSnapshot
-from agent.merging.candidates import corner_candidates, signature_candidates
+from agent.merging.candidates import TARGETS_PER_QUERY, corner_candidates, signature_candidates
 from agent.merging.correlation import correlation_candidates
 from agent.merging.refinement import refined
 from agent.merging.rotations import rotation_candidates
@@ -32,6 +32,8 @@ class Effort:
     scored: int = 300  # of every source, after the coarse score
     drawn: int = 60  # roughly refined
     kept: int = 20  # refined to the end
+    targets: int = TARGETS_PER_QUERY  # places of ours that every telling place of theirs is laid on
+    everywhere: bool = False  # places of ours are all of its walls, not the most telling
 
 
 FIRST_PASS = Effort()  # corners and signatures: 20 ms for two cached indoor maps
@@ -61,7 +63,8 @@ def search(ours: MapSnapshot, theirs: MapSnapshot, effort: Effort) -> tuple[Pose
 def _sources(ours: MapSnapshot, theirs: MapSnapshot, effort: Effort) -> Iterator[Poses]:
     rotations = rotation_candidates(ours.directions, theirs.directions, effort.rotations)
     yield corner_candidates(ours.corners, theirs.corners, rotations)
-    yield signature_candidates(ours.signatures, theirs.signatures, rotations)
+    places_of_ours = ours.dense_signatures if effort.everywhere else ours.signatures
+    yield signature_candidates(places_of_ours, theirs.signatures, rotations, effort.targets)
     if effort.correlated and len(rotations):
         first = rotations[: effort.correlated]
         turns = np.concatenate([rotations, first - NEIGHBOUR_RAD, first + NEIGHBOUR_RAD])

@@ -17,16 +17,11 @@ from agent.merging.transforms import Poses, angle_between, applied
 
 SAME_PLACE_M = 0.8  # two transforms that move the middle of their map less than this, and
 SAME_TURN_RAD = 0.105  # turn it less than 6 degrees, are one hypothesis
-MAX_RIVAL_SHARE = 0.72  # of the best score
 MIN_AGREEING_SHARE = 0.5  # of firm wall that says anything; half is a bar that only vegetation comes near
 MIN_YIELD = 0.15  # score per metre it would be without anything against
-MIN_OBSERVABILITY_M = 2.0
-MIN_OBSERVABLE_SHARE = 0.1  # of agreeing wall: along a long corridor two metres of cross wall are an accident
-MIN_AGREEING_M = 8.0
 USUAL_FACTOR = 0.95  # of true transforms at 10 cm
 FACTOR_SLOPE = 0.3  # coarser cells disagree more at the truth, by this a metre of cell
 MAX_SUSPICION = 1.4  # true pairs of bent maps reach 1.6
-UNSUSPICIOUS = 0.5  # most true pairs lie below; above it more margin is asked for
 MARGIN_PER_SUSPICION_M = 5.0
 MIN_DISTINCT_M = 4.0  # two ends of a building share long walls; what tells them apart is short,
 CLEAR_MARGIN_M = 25.0  # unless nothing else comes near: ends that were merged wrongly were ahead by 7 to 13 m
@@ -66,16 +61,16 @@ class Grounds:
 def verdict(grounds: Grounds, options: MatchOptions) -> tuple[MatchStatus, str]:
     """The answer and its reason."""
     g = grounds
-    if g.agreeing_m <= MIN_AGREEING_M or g.score <= options.min_margin_m:
+    if g.agreeing_m <= options.min_agreeing_m or g.score <= options.min_margin_m:
         return MatchStatus.NO, Reason.LITTLE_WALL
     if g.agreeing_m <= MIN_AGREEING_SHARE * (g.agreeing_m + g.against_m) or g.score <= MIN_YIELD * g.potential_m:
         return MatchStatus.NO, Reason.CONFLICTS
     if g.factor < options.min_match_factor:
         return MatchStatus.NO, Reason.LOW_MATCH_FACTOR
-    if g.observability_m <= max(MIN_OBSERVABILITY_M, MIN_OBSERVABLE_SHARE * g.agreeing_m):
+    if g.observability_m <= max(options.min_observability_m, options.min_observable_share * g.agreeing_m):
         return MatchStatus.AMBIGUOUS, Reason.UNOBSERVABLE
-    needed_m = options.min_margin_m + MARGIN_PER_SUSPICION_M * max(0.0, g.suspicion - UNSUSPICIOUS)
-    if g.score - g.rival <= needed_m or g.rival >= MAX_RIVAL_SHARE * g.score:
+    needed_m = options.min_margin_m + MARGIN_PER_SUSPICION_M * max(0.0, g.suspicion - options.unsuspicious)
+    if g.score - g.rival <= needed_m or g.rival >= options.max_rival_share * g.score:
         return MatchStatus.AMBIGUOUS, Reason.RIVAL
     is_bare = g.distinct_m < MIN_DISTINCT_M and g.score - g.rival < CLEAR_MARGIN_M
     if g.suspicion > MAX_SUSPICION or is_bare:

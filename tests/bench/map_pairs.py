@@ -61,7 +61,7 @@ def simulated_pairs(worlds: list[str], resolution_m: float, walk_m: float = 45.0
         grids = [mapped(world, starts[i], frames[i], walk_m, resolution_m, seed=10 * number + i) for i in range(2)]
         seen.append(grids)
         T = frames[0] @ frames[1].inverse()
-        yield MapPair(spec, grids[0], grids[1], T, _overlap_middle(grids[0], grids[1], T))
+        yield MapPair(spec, grids[0], grids[1], T, overlap_middle(grids[0], grids[1], T))
     for i in range(len(worlds)):
         j = (i + 1) % len(worlds)
         yield MapPair(f"{worlds[i]} x {worlds[j]}", seen[i][0], seen[j][1], None)
@@ -104,7 +104,7 @@ def _walk(world: World, start: SE2, walk_m: float, rng: np.random.Generator) -> 
     return places
 
 
-def _overlap_middle(ours: OccupancyGrid, theirs: OccupancyGrid, T: SE2) -> tuple[float, float]:
+def overlap_middle(ours: OccupancyGrid, theirs: OccupancyGrid, T: SE2) -> tuple[float, float]:
     points = theirs.points_of(np.argwhere(theirs.known()))
     common = points[ours.values_at(T.apply(points)) >= 0]
     middle = (common if len(common) else points).mean(axis=0)
