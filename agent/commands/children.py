@@ -28,9 +28,12 @@ STOP_WITHIN_S = 4.0
 
 
 def child_environment(folder: Path) -> dict[str, str]:
-    """Everything a child keeps is below `folder`; one thread of numerics each, since there are many children."""
-    places = dict.fromkeys(("XDG_RUNTIME_DIR", "XDG_STATE_HOME", "XDG_CONFIG_HOME"), str(folder))
-    return {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", **places}
+    """Everything a child keeps is below `folder`, and the settings of this machine's own robot are not a child's.
+
+    One thread of numerics each, since there are many children.
+    """
+    places = dict.fromkeys(("XDG_RUNTIME_DIR", "XDG_STATE_HOME"), str(folder))
+    return {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MAPQUILT_CONFIG": os.devnull, **places}
 
 
 class ChildError(Exception):
