@@ -7,12 +7,13 @@ cut to cut are handed on.  What was not seen makes the revolution partial:
           never   |<---- one scan, coverage 0.9: partial ----->|
 
 On a line that is not clean an 8-bit checksum lets one damaged packet in 256 through (an XOR lets two equal flips through).
-So in a revolution with damage around it a beam stands only when it lies midway between its two neighbours, as it does on
-a wall, give or take the noise; all others are invalid.  On a clean line nothing is filtered.
+So in a revolution with damage around it, or often before it, a beam stands only when it lies midway between its two
+neighbours, as it does on a wall, give or take the noise; all others are invalid.  On a clean line nothing is filtered.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +26,7 @@ FULL_COVERAGE = 0.95  # issue D: below, a scan is partial and never clears free 
 LEAST_COVERAGE = 0.25  # below, a revolution is not worth handing on
 LONGEST_HOLE = 0.45  # share of a revolution: after a longer hole its cut cannot be told from the next one's
 LEAST_PERIOD_S, MOST_PERIOD_S = 0.03, 2.0  # 30 turns a second to one in two
+MEMORY_TURNS, OFTEN_DIRTY = 20, 2  # a line that was damaged in two turns of twenty is not clean
 MAX_BEAMS = 20000  # a stuck motor turns no more: its revolution never ends
 
 Floats = NDArray[np.float64]
@@ -71,7 +73,7 @@ class ScanAssembler:
         self._is_whole = False  # the pending beams begin at a cut
         self._last_turn_deg: float | None = None
         self._last_stamp_s = 0.0
-        self._was_dirty = False  # the revolution before was
+        self._dirty_turns: deque[bool] = deque(maxlen=MEMORY_TURNS)  # the newest last
 
     def restart(self) -> None:
         """The stream begins anew: what is pending is part of a revolution that was never finished."""
@@ -127,12 +129,16 @@ class ScanAssembler:
             self._hole_s = LONGEST_HOLE * duration_s
         coverage = coverage_of(beams.turn_deg)
         is_dirty = beams.is_dirty is not None and bool(beams.is_dirty.any())
-        must_filter, self._was_dirty = is_dirty or self._was_dirty, is_dirty
+        self._dirty_turns.append(is_dirty)
         if coverage < LEAST_COVERAGE:
             self.discarded += 1
             return None
         self.coverage = coverage
-        return self._scan(beams, coverage, must_filter)
+        return self._scan(beams, coverage, self._is_suspect())
+
+    def _is_suspect(self) -> bool:
+        """Damage now, in the turn before, or more than once of late: altered bytes in a frame leave no gap to be seen by."""
+        return any(list(self._dirty_turns)[-2:]) or sum(self._dirty_turns) >= OFTEN_DIRTY
 
     def _scan(self, beams: Beams, coverage: float, must_filter: bool) -> LaserScan:
         ranges_m = beams.ranges_m
