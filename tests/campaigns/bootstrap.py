@@ -16,7 +16,7 @@ import signal
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -41,12 +41,16 @@ def main() -> int:
     args = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="mapquilt bootstrap ") as folder:
         claims = list(campaign(Path(folder), args.kills, random.Random(args.seed)))
-    if args.json:
-        print(json.dumps([asdict(claim) for claim in claims], indent=1))
-    else:
-        print("| claim | bar | measured | |\n| --- | --- | --- | --- |")
-        print("\n".join(f"| {c.claim} | {c.bar} | {c.measured} | {'holds' if c.holds else 'FAILS'} |" for c in claims))
+    print(table(claims, is_json=args.json))
     return 0 if all(claim.holds for claim in claims) else 1
+
+
+def table(claims: Sequence[Claim], *, is_json: bool) -> str:
+    """For people, or for programs."""
+    if is_json:
+        return json.dumps([asdict(claim) for claim in claims], indent=1)
+    rows = [f"| {c.claim} | {c.bar} | {c.measured} | {'holds' if c.holds else 'FAILS'} |" for c in claims]
+    return "\n".join(["| claim | bar | measured | |", "| --- | --- | --- | --- |", *rows])
 
 
 def campaign(folder: Path, kills: int, rng: random.Random) -> Iterator[Claim]:
