@@ -161,7 +161,7 @@ class StopSignals:
     """SIGTERM and Ctrl-C ask for a clean stop; the second one goes at once."""
 
     def __init__(self) -> None:
-        self._action: Callable[[], None] = lambda: os._exit(130)
+        self._action: Callable[[], None] | None = None  # nothing is open yet that must be closed
         self._count = 0
         signal.signal(signal.SIGTERM, self._on_signal)
         signal.signal(signal.SIGINT, self._on_signal)
@@ -172,7 +172,7 @@ class StopSignals:
 
     def _on_signal(self, number: int, _: object) -> None:
         self._count += 1
-        if self._count > 1:
+        if self._action is None or self._count > 1:
             os._exit(128 + number)
         self._action()
 

@@ -8,13 +8,12 @@ Bars (RELIABILITY.md, C11): all merged into one global map with one digest, at m
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
-from pathlib import Path
 from typing import Any
 
 from tests.harness.fleet import Fleet
+from tests.harness.processes import print_row, resident_mb
 
 MAX_RSS_MB = 120.0
 
@@ -29,11 +28,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args(argv)
     figures = campaign(args)
-    if args.json:
-        print(json.dumps(figures))
-    else:
-        print("| " + " | ".join(figures) + " |\n|" + " --- |" * len(figures))
-        print("| " + " | ".join(f"{v:.1f}" if isinstance(v, float) else str(v) for v in figures.values()) + " |")
+    print_row(figures, as_json=args.json)
     return 0 if figures["one map"] and figures["largest RSS MB"] <= MAX_RSS_MB else 1
 
 
@@ -87,16 +82,6 @@ def seconds_to_one_digest(fleet: Fleet, names: list[str]) -> float | None:
     except AssertionError as error:
         print(str(error)[:4000], file=sys.stderr)
         return None
-
-
-def resident_mb(pid: int) -> float:
-    try:
-        for line in Path(f"/proc/{pid}/status").read_text().splitlines():
-            if line.startswith("VmRSS:"):
-                return int(line.split()[1]) / 1024
-    except OSError:
-        return 0.0
-    return 0.0
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ import itertools
 import os
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +50,14 @@ class Fleet:
         folder.mkdir()
         return self._stack.enter_context(open_stage(world, robots, seed, folder, prefix))
 
-    def start(self, actor: Actor, *, connect: Sequence[str] | None = None, arguments: Sequence[str] = ()) -> AgentProcess:
+    def start(
+        self,
+        actor: Actor,
+        *,
+        connect: Sequence[str] | None = None,
+        arguments: Sequence[str] = (),
+        environment: Mapping[str, str] | None = None,
+    ) -> AgentProcess:
         """A robot's process on an actor's devices, up and ready; by default it dials the first robot that was started."""
         dial = (
             connect
@@ -59,7 +66,7 @@ class Fleet:
         )
         connections = [part for locator in dial for part in ("--connect", locator)]
         common = ["--fleet", self.name, "--no-view", *connections, *arguments]
-        agent = AgentProcess(actor.name, [*actor.arguments(), *common], self.folder)
+        agent = AgentProcess(actor.name, [*actor.arguments(), *common], self.folder, environment)
         previous, self.agents[actor.name] = self.agents.get(actor.name), agent
         assert previous is None or not previous.is_running
         agent.wait_ready()

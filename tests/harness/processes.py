@@ -1,0 +1,59 @@
+"""What the kernel says of a process, and one row of figures about it: for campaigns that watch robots from outside."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+
+def resident_mb(pid: int) -> float:
+    """Memory that is in RAM now; 0 when the process is gone."""
+    return _status(pid, "VmRSS:") / 1024
+
+
+def threads(pid: int) -> int:
+    return _status(pid, "Threads:")
+
+
+def open_files(pid: int) -> int:
+    """Files, sockets and pipes."""
+    try:
+        return len(os.listdir(f"/proc/{pid}/fd"))
+    except OSError:
+        return 0
+
+
+def cpu_s(pid: int) -> float:
+    """User and system time since the process started."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _status(pid: int, name: str) -> int:
+    try:
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    except OSError:
+        return 0
+    return next((int(line.split()[1]) for line in lines if line.startswith(name)), 0)
+
+
+def percentile(values: Sequence[float], share: float) -> float:
+    """The value that this share of all values does not exceed; NaN of nothing."""
+    ordered = sorted(values)
+    return ordered[max(0, math.ceil(share * len(ordered)) - 1)] if ordered else math.nan
+
+
+def print_row(figures: Mapping[str, Any], *, as_json: bool) -> None:
+    """One row of Markdown, or one line of JSON."""
+    if as_json:
+        print(json.dumps(figures))
+        return
+    print("| " + " | ".join(figures) + " |\n|" + " --- |" * len(figures))
+    print("| " + " | ".join(f"{v:.2f}" if isinstance(v, float) else str(v) for v in figures.values()) + " |")
