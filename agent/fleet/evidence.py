@@ -11,6 +11,8 @@ from agent.merging.result import MergeResult, inverse_covariance
 from protocol.geometry import SE2, wrap_angle
 from protocol.messages import Evidence, Symmetric3
 
+MAX_ALTERNATIVES = 4  # in a record; a person looks at no more
+
 
 def evidence_of(us: str, running: Running, result: MergeResult) -> Evidence | None:
     """A result as both sides will speak of it; None when its numbers cannot be trusted."""
@@ -42,10 +44,17 @@ def facts_of(running: Running, result: MergeResult) -> dict[str, Any]:
         "overlap_m2": result.overlap_m2,
         "score": result.score,
         "runner_up": result.runner_up_score,
+        "candidates": result.candidates_tried,
         "ours": running.ours.digest.hex()[:8],
         "theirs": running.theirs.digest.hex()[:8],
-        "T_ours_theirs": None if T is None else (T.x_m, T.y_m, T.theta_rad),
+        "T_ours_theirs": None if T is None else plain(T),
+        "alternatives": [(*plain(a.T_ours_theirs), round(a.score, 2)) for a in result.alternatives[:MAX_ALTERNATIVES]],
     }
+
+
+def plain(T: SE2) -> tuple[float, float, float]:
+    """x, y, yaw to a millimetre and a hundredth of a degree."""
+    return round(float(T.x_m), 3), round(float(T.y_m), 3), round(float(T.theta_rad), 4)
 
 
 def _upper(covariance: object) -> Symmetric3:

@@ -1,7 +1,8 @@
 """A Zenoh session that only speaks: it says what is there, and keeps the last word on a topic for those who come late.
 
 That is ROS 2's transient local durability as rmw_zenoh does it.  Zenoh sends the heartbeats behind it with BLOCK, so a listener
-that dies silently may hold this session up for seconds: it shares nothing with the fleet's, and its callers have their own threads.
+that dies silently may hold this session up for seconds: it shares nothing
+with the fleet's, and its callers have a thread of their own.
 """
 
 from __future__ import annotations

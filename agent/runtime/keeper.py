@@ -16,8 +16,10 @@ from typing import TYPE_CHECKING, Any
 from agent.fleet.state import Presence
 from agent.runtime import snapshot as snapshots
 from agent.runtime.control import ControlError, Handler
+from agent.runtime.drawn_features import DrawnFeatures
 from agent.runtime.latest import Latest
 from agent.runtime.metrics import metrics
+from protocol.features import FeatureMap
 from protocol.geometry import SE2
 from protocol.grid import OccupancyGrid
 from protocol.tiles import MAX_MAP_CELLS, pack_cells, unpack_cells
@@ -46,6 +48,7 @@ class Keeper:
         self._reopen_after_s = REOPEN_AFTER_S
         self._next_open_s = 0.0
         self._seeds = tuple(node.config.fleet.connect)
+        self._features = DrawnFeatures(self.grid)
         self.locators: list[str] = []
         self.links: list[str] = []
 
@@ -165,6 +168,9 @@ class Keeper:
 
     def grid(self, name: str) -> tuple[str, OccupancyGrid] | None:
         return snapshots.grid_of(self._node, name)
+
+    def features(self, name: str) -> FeatureMap | None:
+        return self._features.of(name)
 
     def metrics(self) -> str:
         """The same for Prometheus."""

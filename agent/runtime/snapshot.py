@@ -47,7 +47,13 @@ def snapshot(node: Node) -> dict[str, Any]:
         "odometry": odometry(node),
         "peers": peers(fleet),
         "edges": [
-            {"a": e.robot_a, "b": e.robot_b, "match_factor": round(e.match_factor, 4), "T_a_b": plain_pose(e.T_a_b)}
+            {
+                "a": e.robot_a,
+                "b": e.robot_b,
+                "match_factor": round(e.match_factor, 4),
+                "T_a_b": plain_pose(e.T_a_b),
+                "is_used": e not in fleet.rejected_edges,
+            }
             for e in fleet.edges
         ],
         "global": None

@@ -12,6 +12,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
+from agent.runtime.drawn_features import DrawnFeatures
 from agent.runtime.exchange import Exchange
 from agent.runtime.guard import guard_for
 from agent.runtime.network import NetworkSettings
@@ -21,6 +22,7 @@ from agent.runtime.worker import Worker
 from protocol.channels import fine_register, global_register, parse_key, push_register, subscriptions
 from protocol.codec import decode
 from protocol.errors import LocalProtocolError, RemoteProtocolError
+from protocol.features import FeatureMap
 from protocol.grid import OccupancyGrid
 from protocol.messages import NO_DIGEST, Beat, FineTiles, GlobalMeta, GlobalTiles, Message, Stance, Statement
 from protocol.tiles import TileMap
@@ -54,6 +56,7 @@ class Watcher:
         self._robots: dict[str, Heard] = {}
         self._global: tuple[GlobalMeta, TileMap, OccupancyGrid] | None = None
         self._statements: deque[Statement] = deque(maxlen=KEPT_STATEMENTS)
+        self._features = DrawnFeatures(self.grid)
         self._next_pull_s = time.monotonic()
         self._workers = [
             Worker("listen", self._listen, 5.0, "messages", "what was heard"),
@@ -194,6 +197,10 @@ class Watcher:
             "age_s": round(silent_s),
             "match_factor": round(factors[-1], 4) if factors else None,
         }
+
+    def features(self, name: str) -> FeatureMap | None:
+        """See `ViewSource`."""
+        return self._features.of(name)
 
     def metrics(self) -> str:
         """See `ViewSource`: how long each robot has been silent is all that a watcher measures."""

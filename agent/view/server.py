@@ -1,9 +1,10 @@
 """The live page: one HTML file, a stream of events, and a PNG per map.  Read-only; on loopback unless told otherwise.
 
     GET /                     the page
-    GET /events               text/event-stream: the status as JSON, twice a second when it changed
-    GET /status.json          the same, once
+    GET /events               text/event-stream: what the page draws, when it changes (agent/view/broadcast.py)
+    GET /status.json          the whole status as JSON
     GET /map/<name>.png?v=N   one pixel a cell (agent/view/render.py, grid_png)
+    GET /features/<name>.json the feature map of a map, in strokes (agent/view/page_facts.py)
     GET /metrics              Prometheus text
 
 A page on the internet must not read a robot through a visitor's browser: requests with a foreign Host are refused, and the
@@ -21,23 +22,24 @@ import logging
 import re
 import socket
 import threading
-import time
 from collections.abc import Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
 from typing import Any, Protocol
 
+from agent.view.broadcast import Broadcast
+from agent.view.page_facts import features_json, page_facts
 from agent.view.render import grid_png
+from protocol.features import FeatureMap
 from protocol.grid import OccupancyGrid
 
 log = logging.getLogger(__name__)
 
 MAX_CLIENTS = 32
 REQUEST_TIMEOUT_S = 5.0  # a client that sends its request slowly is hung up on
-EVENT_PERIOD_S = 0.5
-KEEP_ALIVE_S = 10.0
-MAP_PATH = re.compile(r"/map/([a-z0-9][a-z0-9_-]{0,31})\.png")
+NAME = "([a-z0-9][a-z0-9_-]{0,31})"
+MAP_PATH, FEATURES_PATH = re.compile(rf"/map/{NAME}\.png"), re.compile(rf"/features/{NAME}\.json")
 
 
 class ViewSource(Protocol):
@@ -45,6 +47,7 @@ class ViewSource(Protocol):
 
     def status(self) -> Mapping[str, Any]: ...  # JSON values only
     def grid(self, name: str) -> tuple[str, OccupancyGrid] | None: ...  # (version, grid) of "global" or of a robot
+    def features(self, name: str) -> FeatureMap | None: ...  # of the same maps; a moment old is good enough
     def metrics(self) -> str: ...
 
 
@@ -61,11 +64,12 @@ class ViewServer:
         return f"http://{host if isinstance(host, str) else host.decode()}:{port}/"
 
     def start(self) -> None:
+        self._http.events.start()
         self._thread.start()
 
     def close(self) -> None:
-        self._http.closed.set()
         self._http.shutdown()
+        self._http.events.close()
         self._http.server_close()
 
 
@@ -76,7 +80,8 @@ class _Http(ThreadingHTTPServer):
 
     def __init__(self, address: tuple[str, int], source: ViewSource) -> None:
         self.source = source
-        self.closed = threading.Event()
+        self.events = Broadcast(lambda: page_facts(source.status()), self._let_go)
+        self._handed_over: set[Any] = set()  # connections that their handler gave to the broadcast just now
         self.page = resources.files("agent.view").joinpath("index.html").read_bytes()
         self.policy = content_policy(self.page)
         self.pngs: dict[str, tuple[str, bytes]] = {}
@@ -98,7 +103,24 @@ class _Http(ThreadingHTTPServer):
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self._clients.release()
+            if request in self._handed_over:
+                self._handed_over.discard(request)
+            else:
+                self._clients.release()
+
+    def watch(self, request: Any) -> None:
+        """Leave a connection to the broadcast."""
+        self._handed_over.add(request)
+        self.events.join(request)
+
+    def shutdown_request(self, request: Any) -> None:
+        if request not in self._handed_over:
+            super().shutdown_request(request)
+
+    def _let_go(self, request: Any) -> None:
+        """The broadcast is done with a connection."""
+        request.close()
+        self._clients.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         log.debug("view: client %s", client_address, exc_info=True)
@@ -156,30 +178,20 @@ class _Handler(BaseHTTPRequestHandler):
         elif path == "/":
             self._send(HTTPStatus.OK, "text/html; charset=utf-8", self.server.page)
         elif path == "/events":
-            self._events()
+            self._head(HTTPStatus.OK, "text/event-stream", None)
+            self.server.watch(self.connection)
         elif path == "/status.json":
             self._send(HTTPStatus.OK, "application/json", json.dumps(self.server.source.status()).encode())
         elif path == "/metrics":
             self._send(HTTPStatus.OK, "text/plain; version=0.0.4", self.server.source.metrics().encode())
         elif (match := MAP_PATH.fullmatch(path)) is not None and (picture := self.server.png_of(match[1])) is not None:
             self._send(HTTPStatus.OK, "image/png", picture[1])
+        elif (match := FEATURES_PATH.fullmatch(path)) is not None and (
+            features := self.server.source.features(match[1])
+        ) is not None:
+            self._send(HTTPStatus.OK, "application/json", json.dumps(features_json(features)).encode())
         else:
             self._send(HTTPStatus.NOT_FOUND, "text/plain", b"not here\n")
-
-    def _events(self) -> None:
-        self._head(HTTPStatus.OK, "text/event-stream", None)
-        last, sent_s = b"", time.monotonic()
-        while not self.server.closed.is_set():
-            data = json.dumps(self.server.source.status()).encode()
-            now = time.monotonic()
-            if data != last:
-                self.wfile.write(b"data: " + data + b"\n\n")
-                last, sent_s = data, now
-            elif now - sent_s > KEEP_ALIVE_S:
-                self.wfile.write(b": still here\n\n")
-                sent_s = now
-            self.wfile.flush()
-            self.server.closed.wait(EVENT_PERIOD_S)
 
     def _send(self, status: HTTPStatus, kind: str, body: bytes) -> None:
         self._head(status, kind, len(body))

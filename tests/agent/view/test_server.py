@@ -16,7 +16,9 @@ import cv2
 import numpy as np
 import pytest
 
+from agent.view import broadcast
 from agent.view.server import MAX_CLIENTS, ViewServer, _Handler
+from protocol.features import FeatureMap
 from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 PAGE = resources.files("agent.view").joinpath("index.html").read_text()
@@ -29,14 +31,26 @@ class Source:
         self.scans = 0
 
     def status(self) -> Mapping[str, Any]:
-        return {"robot": "r1", "scans": self.scans}
+        return {"robot": "r1", "facts": {"scans": str(self.scans)}, "problems": [], "workers": ["secret"]}
 
     def grid(self, name: str) -> tuple[str, OccupancyGrid] | None:
         cells = np.array([[OCCUPIED, FREE, UNKNOWN], [FREE, FREE, FREE]], np.int8)
         return ("1.1", OccupancyGrid(cells, 0.05)) if name == "r1" else None
 
+    def features(self, name: str) -> FeatureMap | None:
+        lines = np.array([[1, 2, 0.5, 3, 0.01, 0.01]], np.float32)
+        circles = np.array([[4, 5, 0.25, 0.01]], np.float32)
+        return FeatureMap(lines=lines, circles=circles) if name == "r1" else None
+
     def metrics(self) -> str:
         return "mapquilt_scans_total 0\n"
+
+
+class Ballast(Source):
+    """A robot with very much to say."""
+
+    def status(self) -> Mapping[str, Any]:
+        return {"robot": "r1", "facts": {"scans": str(self.scans), "ballast": str(self.scans) * 400_000}}
 
 
 @pytest.fixture
@@ -103,18 +117,64 @@ def test_it_is_read_only(server: ViewServer, method: str) -> None:
     assert get(server, "/", method=method)[0] == 501
 
 
-def test_events_come_when_something_changed() -> None:
+def test_the_features_of_a_map_come_in_strokes(server: ViewServer) -> None:
+    strokes = json.loads(get(server, "/features/r1.json")[2])
+    assert strokes == {"lines": [[1, 2, 0.5, 3]], "arcs": [[4, 5, 0.25, 0, 6.283]], "curves": []}
+    assert get(server, "/features/none.json")[0] == 404
+
+
+class Listener:
+    """A viewer's event stream."""
+
+    def __init__(self, server: ViewServer, stack: contextlib.ExitStack) -> None:
+        address = urlsplit(server.url)
+        self.socket = stack.enter_context(socket.create_connection((address.hostname, address.port), timeout=5))
+        self.socket.sendall(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        self._lines = self.socket.makefile("rb")
+
+    def next(self) -> dict[str, Any]:
+        found = json.loads(next(line for line in self._lines if line.startswith(b"data: "))[6:])
+        assert isinstance(found, dict)
+        return found
+
+
+def test_the_first_event_is_everything_and_the_next_what_changed() -> None:
     source = Source()
     server = ViewServer(source, 0)
     server.start()
-    address = urlsplit(server.url)
-    with socket.create_connection((address.hostname, address.port), timeout=5) as client:
-        client.sendall(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
-        stream = client.makefile("rb")
-        first = next(line for line in stream if line.startswith(b"data: "))
+    with contextlib.ExitStack() as stack:
+        early = Listener(server, stack)
+        everything = early.next()["full"]
+        assert everything["facts"] == {"scans": "0"}
+        assert "workers" not in everything
         source.scans = 7
-        second = next(line for line in stream if line.startswith(b"data: "))
-        assert [json.loads(line[6:])["scans"] for line in (first, second)] == [0, 7]
+        assert early.next() == {"part": {"facts": {"scans": "7"}}}
+        assert Listener(server, stack).next()["full"]["facts"] == {"scans": "7"}  # who comes late has missed nothing
+    server.close()
+
+
+def scans(event: dict[str, Any]) -> int:
+    """Of a full event or a part."""
+    (told,) = event.values()
+    return int(told["facts"]["scans"])
+
+
+def test_a_viewer_that_does_not_read_holds_nobody_up_and_gets_everything_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(broadcast, "PERIOD_S", 0.02)
+    source = Ballast()
+    server = ViewServer(source, 0)
+    server.start()
+    with contextlib.ExitStack() as stack:
+        asleep, awake = Listener(server, stack), Listener(server, stack)
+        for source.scans in range(1, 16):  # far more than the kernel holds for the sleeper
+            while scans(awake.next()) < source.scans:
+                pass
+        seen = [asleep.next()]
+        while scans(seen[-1]) < source.scans:
+            seen.append(asleep.next())
+        assert "full" in seen[0]
+        assert "full" in seen[-1]
+        assert len(seen) < 16
     server.close()
 
 
