@@ -1,165 +1,115 @@
-"""Ten thousand pairs of maps that must not merge: other buildings, disjoint parts, mirror images, worlds that repeat.
+"""Ten thousand pairs of maps that must not merge, in blocks that several processes share and a later run takes up again.
 
-.venv/bin/python -m tests.campaigns.false_merges                 10,000 pairs
+.venv/bin/python -m tests.campaigns.false_merges                 10,000 pairs on two processes
 .venv/bin/python -m tests.campaigns.false_merges --pairs 500     a sample
+.venv/bin/python -m tests.campaigns.false_merges --seed 2        other pairs
 
-Maps come from seeded floor plans, and from the evaluation kit where BENCH_DATA (one or more folders, separated by ':') has
-been built.  Every accepted pair is printed; the exit code counts them.
+Which pairs those are: `negative_pairs.py`; BENCH_DATA says where recordings lie.  Every block that is done is a line of
+out/campaigns/false_merges-SEED-CODE.jsonl; the same command begins where it was stopped, and anew when the code or
+the recordings are others.  Every accepted pair is printed; the exit code counts them.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
-import math
-import os
+import multiprocessing
 import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
-import numpy as np
 
-from agent.features.snapshot import MapSnapshot
 from agent.merging.matching import match_maps
-from protocol.geometry import SE2
-from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from tests.harness.floorplans import office
+from tests.campaigns.negative_pairs import folders, negatives
 
-MAPS_HELD = 90  # snapshots of recordings kept at a time: every pair among them is a candidate
-
-
-@dataclass(frozen=True, eq=False)
-class Source:
-    """One map and where it is from: maps of different places must never merge."""
-
-    name: str
-    place: str
-    snapshot: MapSnapshot
+REPO = Path(__file__).resolve().parents[2]
+BLOCK = 250  # pairs
 
 
-@dataclass(frozen=True, eq=False)
-class Negative:
-    kind: str
-    ours: Source
-    theirs: Source
+def judged(seed: int, block: int) -> dict[str, Any]:
+    """One block: how many of each kind, which merged, and the CPU of matching and of everything."""
+    cv2.setNumThreads(1)
+    started = time.process_time()
+    tried: Counter[str] = Counter()
+    spent: Counter[str] = Counter()
+    merged = []
+    for pair in negatives(seed, block, BLOCK):
+        before = time.process_time()
+        result = match_maps(pair.ours.snapshot, pair.theirs.snapshot)
+        spent[pair.kind] += time.process_time() - before
+        tried[pair.kind] += 1
+        if result.accepted:
+            numbers = {name: round(value, 2) for name, value in result.evidence.items()}
+            merged.append({"kind": pair.kind, "ours": pair.ours.name, "theirs": pair.theirs.name, "evidence": numbers})
+    return {"block": block, "tried": tried, "spent_s": spent, "merged": merged, "all_s": time.process_time() - started}
 
 
-def recordings(rng: np.random.Generator) -> Iterator[Negative]:
-    """Pairs of the kit's maps without end: other buildings, and mirror images of the same and of other buildings."""
-    found = [(folder, entry) for folder in _folders() for entry in json.loads((folder / "pairs.json").read_text())]
-    if not found:
-        return
-    while True:
-        chosen = [found[i] for i in rng.permutation(len(found))[: MAPS_HELD // 2]]
-        plain = [source for folder, entry in chosen for source in _both_maps(folder, entry)]
-        mirrored = [Source(s.name + " mirrored", s.place, _mirrored(s.snapshot)) for s in plain[: MAPS_HELD // 3]]
-        for _ in range(600):
-            a, b = (plain[i] for i in rng.integers(len(plain), size=2))
-            if not _related(a.place, b.place):
-                yield Negative("other building", a, b)
-            m = mirrored[int(rng.integers(len(mirrored)))]
-            same = a.place == m.place
-            yield Negative("mirrored, same building" if same else "mirrored, other building", a, m)
-        for folder, entry in chosen:
-            if entry["kind"] == "neg" and entry["log_a"] == entry["log_b"]:
-                yield Negative("disjoint parts of a building", *_both_maps(folder, entry))
+def code_hash() -> str:
+    """Of what decides: the code of features and merging, and which recordings there are."""
+    files = sorted(
+        [*REPO.glob("agent/features/*.py"), *REPO.glob("agent/merging/*.py"), Path(__file__).with_name("negative_pairs.py")]
+    )
+    told = hashlib.sha256(b"".join(path.read_bytes() for path in files))
+    told.update("".join(map(str, folders())).encode())
+    return told.hexdigest()[:10]
 
 
-def _folders() -> list[Path]:
-    roots = [Path(root) for root in os.environ.get("BENCH_DATA", "").split(":") if root]
-    return [path.parent for root in roots for path in sorted(root.glob("*/pairs.json"))]
+def blocks_of(store: Path, wanted: int, seed: int, jobs: int) -> Iterator[dict[str, Any]]:
+    """Results of the first blocks: those in the store, then the others as they are done."""
+    done = [result for result in _stored(store) if result["block"] < wanted]
+    yield from done
+    left = sorted(set(range(wanted)) - {result["block"] for result in done})
+    with multiprocessing.get_context("spawn").Pool(jobs) as pool, store.open("a") as log:
+        for result in pool.imap_unordered(partial(judged, seed), left):
+            print(json.dumps(result), file=log, flush=True)
+            yield result
 
 
-def _both_maps(folder: Path, entry: dict[str, str]) -> tuple[Source, Source]:
-    return _one_map(folder, entry, "a"), _one_map(folder, entry, "b")
+def _stored(store: Path) -> list[dict[str, Any]]:
+    """Whole lines only: the last one may have been cut by a kill, and is then taken away."""
+    whole = [line for line in store.read_text().splitlines(keepends=True) if line.endswith("\n")] if store.is_file() else []
+    store.write_text("".join(whole))
+    return [json.loads(line) for line in whole]
 
 
-def _one_map(folder: Path, entry: dict[str, str], side: str) -> Source:
-    with np.load(folder / "maps" / f"{entry['id']}_{side}.npz") as stored:
-        grid = OccupancyGrid(stored["grid"].astype(np.int8), float(entry["res"]))
-    return Source(f"{folder.parent.name}/{folder.name}/{entry['id']}{side}", entry[f"log_{side}"], MapSnapshot.of(grid))
-
-
-def _related(a: str, b: str) -> bool:
-    return a.partition("-")[0] == b.partition("-")[0]  # freiburg-079 and freiburg-campus may share walls
-
-
-def _mirrored(snapshot: MapSnapshot) -> MapSnapshot:
-    cells = np.ascontiguousarray(snapshot.grid.cells[:, ::-1])
-    return MapSnapshot.of(OccupancyGrid(cells, snapshot.grid.resolution_m))
-
-
-def drawn(rng: np.random.Generator) -> Iterator[Negative]:
-    """Pairs of drawn maps without end: other plans, mirrored plans, disjoint ends of a plan, and corridors that repeat."""
-    while True:
-        seed = int(rng.integers(1 << 30))
-        plan, other = office(seed), office(seed + 1)
-        T = SE2(0.0, 0.0, float(rng.uniform(-math.pi, math.pi)))
-        ours = Source(f"office {seed}", "a", MapSnapshot.of(plan.mapped(T, noise_m=0.02, seed=1)))
-        theirs = MapSnapshot.of(other.mapped(SE2(1.0, 2.0, float(rng.uniform(-3, 3))), noise_m=0.02, seed=2))
-        yield Negative("other plan", ours, Source(f"office {seed + 1}", "b", theirs))
-        yield Negative("mirrored plan", ours, Source(f"office {seed} mirrored", "b", _mirrored(ours.snapshot)))
-        third = plan.width_m / 3
-        left = MapSnapshot.of(plan.mapped(T, x_range_m=(-1.0, third), noise_m=0.02, seed=3))
-        right = MapSnapshot.of(plan.mapped(SE2(5.0, 1.0, 1.0), x_range_m=(2 * third, 1e3), noise_m=0.02, seed=4))
-        yield Negative("disjoint ends of a plan", Source("left", "a", left), Source("right", "b", right))
-        a, b = (Source(f"corridor {k}", k, _corridor(rng, first)) for k, first in (("a", 0), ("b", 6)))
-        yield Negative("repeating corridor", a, b)
-
-
-def _corridor(rng: np.random.Generator, first_room: int) -> MapSnapshot:
-    """Part of an endless corridor: the same room behind every door, and nothing to tell one stretch from the next."""
-    cells = np.full((160, 420), UNKNOWN, np.int8)
-    cells[70:90, 10:410] = FREE
-    for k in range(10):
-        x = 10 + 40 * k
-        for low, high in ((20, 69), (91, 140)):
-            cells[low:high, x + 1 : x + 40] = FREE
-            cells[low, x : x + 41] = cells[high, x : x + 41] = OCCUPIED
-            cells[low : high + 1, x] = cells[low : high + 1, x + 40] = OCCUPIED
-        cells[69, x : x + 41] = cells[91, x : x + 41] = OCCUPIED
-        cells[69, x + 15 : x + 25] = cells[91, x + 15 : x + 25] = FREE
-    noise = rng.random(cells.shape)
-    cells[(cells == OCCUPIED) & (noise < 0.05)] = FREE
-    part = cells[:, 10 + 40 * (first_room // 3) : 10 + 40 * (first_room // 3) + 250]
-    turned = np.ascontiguousarray(np.rot90(part, first_room))
-    return MapSnapshot.of(OccupancyGrid(np.pad(turned, 3, constant_values=UNKNOWN), 0.1))
+def report(results: list[dict[str, Any]]) -> str:
+    tried, spent, merged = Counter[str](), Counter[str](), Counter[str]()
+    for result in results:
+        tried.update(result["tried"])
+        spent.update(result["spent_s"])
+        merged.update(pair["kind"] for pair in result["merged"])
+    lines = ["| negative pairs | tried | merged | CPU ms a match |", "|---|---|---|---|"]
+    lines += [f"| {kind} | {tried[kind]} | {merged[kind]} | {1e3 * spent[kind] / tried[kind]:.0f} |" for kind in sorted(tried)]
+    total = max(1, tried.total())
+    whole_s = sum(result["all_s"] for result in results)
+    lines.append(f"| **all** | {tried.total()} | **{merged.total()}** | {1e3 * sum(spent.values()) / total:.0f} |")
+    return "\n".join(
+        [*lines, "", f"CPU {whole_s:.0f} s, {1e3 * whole_s / total:.0f} ms a pair with making the maps and their features"]
+    )
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])  # type: ignore[union-attr]
-    parser.add_argument("--pairs", type=int, default=10_000)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--pairs", type=int, default=10_000, help=f"in blocks of {BLOCK} (default 10,000)")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--jobs", type=int, default=2, help="processes (default 2)")
     args = parser.parse_args()
-    cv2.setNumThreads(1)
-    tried: Counter[str] = Counter()
-    merged: Counter[str] = Counter()
-    spent: Counter[str] = Counter()
-    rngs = np.random.default_rng(args.seed).spawn(2)
-    sources = [recordings(rngs[0]), recordings(rngs[0]), recordings(rngs[0]), drawn(rngs[1])]
-    while sum(tried.values()) < args.pairs:
-        for source in sources:
-            pair = next(source, None)
-            if pair is None:
-                continue
-            started = time.process_time()
-            result = match_maps(pair.ours.snapshot, pair.theirs.snapshot)
-            spent[pair.kind] += time.process_time() - started
-            tried[pair.kind] += 1
-            if result.accepted:
-                merged[pair.kind] += 1
-                numbers = {name: round(value, 2) for name, value in result.evidence.items()}
-                print(f"MERGED {pair.kind}: {pair.ours.name} with {pair.theirs.name} {numbers}", file=sys.stderr, flush=True)
-    print("| negative pairs | tried | merged | CPU ms a pair |\n|---|---|---|---|")
-    for kind in sorted(tried):
-        print(f"| {kind} | {tried[kind]} | {merged[kind]} | {1e3 * spent[kind] / tried[kind]:.0f} |")
-    total = sum(tried.values())
-    print(f"| **all** | {total} | **{sum(merged.values())}** | {1e3 * sum(spent.values()) / total:.0f} |")
-    return min(100, sum(merged.values()))
+    store = REPO / "out" / "campaigns" / f"false_merges-{args.seed}-{code_hash()}.jsonl"
+    store.parent.mkdir(parents=True, exist_ok=True)
+    wanted, started, results = -(-args.pairs // BLOCK), time.monotonic(), []
+    for result in blocks_of(store, wanted, args.seed, args.jobs):
+        results.append(result)
+        for pair in result["merged"]:
+            print(f"MERGED {pair['kind']}: {pair['ours']} with {pair['theirs']} {pair['evidence']}", file=sys.stderr)
+        print(f"{len(results)}/{wanted} blocks, {time.monotonic() - started:.0f} s", file=sys.stderr, flush=True)
+    print(report(results))
+    return min(100, sum(len(result["merged"]) for result in results))
 
 
 if __name__ == "__main__":
