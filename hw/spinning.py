@@ -66,6 +66,8 @@ class _Waiting:
 class SpinningLidar(DriverBase):
     """A `Driver` but for the protocol: `_find`, `_is_turn` and `_beams` are its own."""
 
+    doubts_before_gap = False  # a frame that lost bytes is filled up with the next one's, and that leaves a gap behind it
+
     def __init__(self, range_min_m: float, range_max_m: float) -> None:
         super().__init__()
         self._window = ByteWindow(self.counters)
@@ -152,6 +154,8 @@ class SpinningLidar(DriverBase):
         )
         self._last = _Waiting(data[-1:], gaps[-1:], arrivals_s[-1:], bool(follows[-1]))
         is_seen = follows[:-1] | follows[1:]
+        if self.doubts_before_gap:
+            is_seen &= gaps[1:] == 0
         self.counters.rejected += int(np.count_nonzero(~is_seen))
         dirty = carried((gaps[:-1] > 0) | ~is_seen, is_seen)
         return data[:-1][is_seen], dirty.astype(np.int64), arrivals_s[:-1][is_seen]

@@ -144,6 +144,8 @@ def correction_deg(mm: Floats) -> Floats:
 class YdLidar(SpinningLidar):
     """Driver of the family.  Without a model the unit is asked; one that does not answer is taken for an X2."""
 
+    doubts_before_gap = True  # another packet's distances look like a wall, and equal bytes cancel in an XOR
+
     def __init__(self, model: str | None = None, intensity_bits: int | None = None) -> None:
         self.model = MODELS[model or "x4"]
         super().__init__(RANGE_MIN_M, self.model.range_max_m)
