@@ -158,7 +158,7 @@ class Coordinator:
         turn = self._next_peers()
         for peer in turn:
             self._pulling.pull_words(peer, now_s)
-            if peer.held != peer.admitted:
+            if peer.held is not None and (peer.held != peer.admitted or peer.anchor is None):
                 self._admission.admit(peer, now_s)
         self._pairs.next_job(turn, now_s)
         self._pulling.pull_maps(turn, now_s)

@@ -124,7 +124,7 @@ class Inbox:
             self._ledger.note("forged-map", is_warning=True, peer=peer.robot, reason=str(error))
             self._pairs.words.strike(peer, "forged map", now_s)
             return
-        peer.maps.add(tiles)
+        peer.maps.add(tiles, needed=peer.admitted.digest if peer.admitted is not None else b"")
         if peer.held is not None and peer.held.frame != said.map.frame:
             peer.anchor = None
         is_newest = peer.held is None or peer.held.frame != said.map.frame or said.map.revision > peer.held.revision

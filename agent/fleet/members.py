@@ -8,6 +8,7 @@ from agent.fleet.options import FleetOptions
 from agent.fleet.own_map import History
 from agent.fleet.state import Presence
 from agent.fleet.trust import Trust
+from protocol.geometry import SE2
 from protocol.grid import OccupancyGrid
 from protocol.messages import Beat, CoarseMap, GlobalMeta, Hello, MapAnnouncement, MapVersion, Message, Statement, Statements
 
@@ -46,9 +47,11 @@ class Peer:
     grid: OccupancyGrid | None = None  # the cells of `held`
     area_m2: float = 0.0  # known area of `held`
     admitted: MapVersion | None = None  # the newest version that may enter the global map
-    anchor: OccupancyGrid | None = None  # its cells when an edge was last checked: what newer cells must not contradict
+    admitted_at: SE2 | None = None  # T_ours_theirs then
+    anchor: OccupancyGrid | None = None  # its word: the cells it showed first; newer ones may add to them
     refused: bytes = b""  # a version of its cells that may not enter the global map
-    judged: tuple[bytes, bytes] = (b"", b"")  # (ours, theirs) that led to that
+    held_back_s: float | None = None  # since when its newest cells wait
+    judged: tuple[object, ...] = ()  # what was looked at when they were held back last
     maps: History = field(default_factory=lambda: History(_KEPT_PEER_MAPS))
     versions: dict[bytes, MapVersion] = field(default_factory=dict)  # of everything in `maps`
     ghosts: dict[int, Ghost] = field(default_factory=dict)

@@ -55,9 +55,12 @@ class History:
         self._kept = kept
         self._maps: OrderedDict[bytes, TileMap] = OrderedDict()
 
-    def add(self, tiles: TileMap) -> None:
+    def add(self, tiles: TileMap, needed: bytes = b"") -> None:
+        """Keep one more; the one that is needed goes last."""
+        for digest in (needed, tiles.digest):
+            if digest in self._maps:
+                self._maps.move_to_end(digest)
         self._maps[tiles.digest] = tiles
-        self._maps.move_to_end(tiles.digest)
         while len(self._maps) > self._kept:
             self._maps.popitem(last=False)
 

@@ -13,9 +13,9 @@ STRIKES = {
     "equivocation": 3.0,  # two different statements under one number: nobody says that by accident
     "false proposal": 0.5,  # another transform on the very maps on which one was refused already
     # A particle filter that changes its mind redraws its map honestly: the edge falls and is verified anew, and the strike is
-    # forgotten before many can follow.
+    # forgotten before many can follow.  Redrawn maps move in pieces that are found again; only inventions deny themselves.
     "map turned false": 0.2,  # a map that fitted begins to contradict ours
-    "map broke its word": 0.2,  # its walls are elsewhere than they were
+    "map denies itself": 3.0,  # nearly all walls are gone from where two others still see them, and found nowhere near
 }
 
 
