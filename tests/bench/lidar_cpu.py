@@ -44,6 +44,9 @@ NAMES = {
 }
 
 
+START_EVERY_S = 1.5  # long enough for three turns of the slowest
+
+
 @dataclass
 class Row:
     """One device."""
@@ -81,9 +84,9 @@ def measure(name: str, seconds: float) -> Row:
     master, slave = pty.openpty()
     tty.setraw(slave)
     path = os.ttyname(slave)
-    stop = multiprocessing.Event()
+    stop, is_read = multiprocessing.Event(), multiprocessing.Event()
     stream = STREAMS[name](seconds=30.0 if name in ("ld06", "stl27l") else 2.0)
-    sender = multiprocessing.get_context("fork").Process(target=send, args=(stream, master, stop), daemon=True)
+    sender = multiprocessing.get_context("fork").Process(target=send, args=(stream, master, stop, is_read), daemon=True)
     sender.start()
     url = parse_url(f"{SCHEMES[name]}:{path}")
     # the sender answers no questions, as most LIDARs stream whether asked or not
@@ -91,7 +94,8 @@ def measure(name: str, seconds: float) -> Row:
     with device:
         deadline_s = time.monotonic() + 30.0
         while device.health().readings < 10:
-            device.read(1.0)
+            if device.read(1.0) is not None:
+                is_read.set()
             if time.monotonic() > deadline_s:
                 raise SystemExit(f"{name}: {device.health().last_error}")
         row = _watch(name, device, seconds)
@@ -124,17 +128,16 @@ def _watch(name: str, device: Device, seconds: float) -> Row:
     )
 
 
-def send(stream: Stream, master: int, stop: Event) -> None:
-    """The device: its bytes, at its pace, in millisecond portions."""
+def send(stream: Stream, master: int, stop: Event, is_read: Event) -> None:
+    """The device: its bytes, at its pace, in millisecond portions; begun anew until the reader has made sense of them."""
     data = stream.data
     begin_s, at = time.monotonic(), 0
-    prefix_until_s = begin_s + 1.0 if stream.prefix else 0.0
-    next_prefix_s = begin_s
+    next_start_s = begin_s
     while not stop.is_set():
         now_s = time.monotonic()
-        if now_s < prefix_until_s and now_s >= next_prefix_s:  # the reader may still be opening
+        if stream.prefix and now_s >= next_start_s and not is_read.is_set():  # the reader flushes what came while it opened
             os.write(master, stream.prefix)
-            next_prefix_s, begin_s, at = now_s + 0.25, now_s, 0
+            next_start_s, begin_s, at = now_s + START_EVERY_S, now_s, 0
         n = int((now_s - begin_s) * stream.bytes_per_s) - at
         if n > 0:
             first = at % len(data)
