@@ -6,7 +6,7 @@ verified on them, with two until they no longer contradict.  A map that denies i
 
 from __future__ import annotations
 
-from agent.fleet.broken_word import TakenBack, grown, share_found_again, taken_back, testimony
+from agent.fleet.broken_word import TakenBack, grown, share_found_again, taken_back, witnessed
 from agent.fleet.consistency import agreement
 from agent.fleet.ledger import Ledger, pair_key
 from agent.fleet.members import Peer
@@ -28,7 +28,7 @@ class Admission:
         assert peer.held is not None and peer.grid is not None
         group, own = self._ledger.group, self._ledger.own
         if group is None or peer.robot not in group.T_root or own.grid is None or own.version is None:
-            peer.admitted, peer.refused, peer.held_back_s = peer.held, b"", None  # in no global map of ours
+            peer.admitted, peer.held_back_s = peer.held, None  # in no global map of ours
             return
         T_ours_theirs = group.T_root[self._ledger.robot].inverse() @ group.T_root[peer.robot]
         is_checked, is_vouched = self._is_checked(peer), self._is_vouched_for(peer)
@@ -64,7 +64,7 @@ class Admission:
         """The robots, ourselves among them, that still see what the newest cells take back."""
         options, against = self._ledger.options, []
         for robot, witness, T_witness_map in self._witnesses(peer):
-            said = testimony(change, witness, T_witness_map)
+            said = witnessed(change, witness, T_witness_map)
             if said.plain > options.max_taken_back or said.near > options.max_moved_walls:
                 against.append(robot)
         assert peer.grid is not None
@@ -95,14 +95,18 @@ class Admission:
             peer.anchor = grown(peer.anchor, peer.grid)
         if peer.held_back_s is not None:
             self._ledger.note("taken-in-again", peer=peer.robot)
-        peer.admitted, peer.admitted_at, peer.refused, peer.held_back_s = peer.held, T_ours_theirs, b"", None
+        peer.admitted, peer.admitted_at, peer.held_back_s = peer.held, T_ours_theirs, None
+        if peer.held is not None and peer.held.digest in peer.refused:
+            peer.refused.remove(peer.held.digest)
 
     def _hold_back(self, peer: Peer, T_ours_theirs: SE2, witnesses: int, now_s: float) -> None:
         assert peer.held is not None
         if peer.held_back_s is None:
             peer.held_back_s = now_s
             self._ledger.note("held-back", is_warning=True, peer=peer.robot, witnesses=witnesses)
-        peer.refused, self._pairs.words.pair(peer.robot).is_urgent = peer.held.digest, self._is_neighbour(peer)
+        if peer.held.digest not in peer.refused:
+            peer.refused.append(peer.held.digest)
+        self._pairs.words.pair(peer.robot).is_urgent = self._is_neighbour(peer)
         self._drop_misplaced(peer, T_ours_theirs)
 
     def _drop_misplaced(self, peer: Peer, T_ours_theirs: SE2) -> None:

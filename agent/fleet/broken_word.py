@@ -21,7 +21,7 @@ _BESIDE = np.ones((3, 3), np.uint8)
 _SAMPLES = 4_000  # cells of the earlier map that tell how much of it a witness knows
 _PATCH_CELLS, _PATCH_STEP, _SEARCH_CELLS = 24, 12, 24  # pieces of a map, coarse enough that a dozen fit into a corridor
 _TURNS_DEG = (0.0, -5.0, 5.0, -10.0, 10.0, -15.0, 15.0)
-_ALIKE = 0.5  # correlation of a piece with the place where it is found again; pieces of other places reach 0.4
+_ALIKE = 0.6  # correlation of a piece with the place where it is found again
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,7 +60,7 @@ def taken_back(earlier: OccupancyGrid, newer: OccupancyGrid) -> TakenBack:
     return TakenBack(window.points_of(changed), vanished[rows, cols], near[rows, cols], earlier, walls)
 
 
-def testimony(change: TakenBack, witness: OccupancyGrid, T_witness_map: SE2) -> Testimony:
+def witnessed(change: TakenBack, witness: OccupancyGrid, T_witness_map: SE2) -> Testimony:
     """What one other map says of the change."""
     known = np.argwhere(change.earlier.known())
     step = max(1, len(known) // _SAMPLES)

@@ -267,7 +267,7 @@ class Composition:
             if member.map.frame != self._ledger.frame_of(member.robot):
                 return False
             peer = self._ledger.peers.get(member.robot)
-            if peer is not None and peer.refused == member.map.digest:
+            if peer is not None and member.map.digest in peer.refused:
                 return False
             if T.distance_m(ours) > _FOLLOW_M or abs(wrap_angle(T.theta_rad - ours.theta_rad)) > _FOLLOW_RAD:
                 return False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field
 
 from agent.fleet.options import FleetOptions
@@ -14,6 +15,7 @@ from protocol.messages import Beat, CoarseMap, GlobalMeta, Hello, MapAnnouncemen
 
 _RETIRED_BOOTS = 4
 _KEPT_PEER_MAPS = 6
+_KEPT_REFUSALS = 64
 
 
 @dataclass(slots=True)
@@ -49,7 +51,9 @@ class Peer:
     admitted: MapVersion | None = None  # the newest version that may enter the global map
     admitted_at: SE2 | None = None  # T_ours_theirs then
     anchor: OccupancyGrid | None = None  # its word: the cells it showed first; newer ones may add to them
-    refused: bytes = b""  # a version of its cells that may not enter the global map
+    refused: deque[bytes] = field(
+        default_factory=lambda: deque(maxlen=_KEPT_REFUSALS)
+    )  # versions held back: no recipe may use them
     held_back_s: float | None = None  # since when its newest cells wait
     judged: tuple[object, ...] = ()  # what was looked at when they were held back last
     maps: History = field(default_factory=lambda: History(_KEPT_PEER_MAPS))

@@ -42,7 +42,7 @@ class FleetOptions:
     max_taken_back: float = 0.004  # share of the cells another robot confirms that a member may take back; honest maps: 0.0033
     max_moved_walls: float = 0.012  # the same, walls that moved by one cell included; honest maps: 0.008
     denied_walls: float = 0.35  # share of its walls that are elsewhere in spite of two others, and hardly a piece of its earlier
-    found_again: float = 0.25  # map found again anywhere near: that is no redrawing, it is another place or an invention
+    found_again: float = 0.3  # map found again anywhere near: that is no redrawing, it is another place or an invention
     held_back_s: float = 300.0  # a map held back for this long whose edges are verified all the same is believed again
     renew_period_s: float = 15.0  # a live edge whose maps changed is checked and proposed anew at least this often
     quarantine_strikes: int = 3  # provable untruths before a peer's statements are no longer heard

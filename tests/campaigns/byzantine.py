@@ -153,8 +153,14 @@ def main() -> int:
             f"| {_seconds([v.contained_s for v in own])} | {_seconds([v.quarantined_s for v in own])} "
             f"| {sum(v.is_unmerge_exact for v in own)} of {len(own)} |"
         )
-    is_good = all(v.final_share <= 0.005 and not v.misplaced and not v.separated and v.is_unmerge_exact for v in verdicts)
-    return 0 if is_good else 1
+    return 0 if all(is_good(verdict) for verdict in verdicts) else 1
+
+
+def is_good(verdict: Verdict) -> bool:
+    """The bars: half a percent at any moment, honest robots in place and together, provable liars out within five seconds."""
+    is_caught = verdict.quarantined_s is not None and verdict.quarantined_s <= 5.0
+    is_harmless = verdict.worst_share <= 0.005 and not verdict.misplaced and not verdict.separated
+    return is_harmless and verdict.is_unmerge_exact and (is_caught or not ATTACKS[verdict.attack].is_detectable)
 
 
 def _seconds(values: list[float | None]) -> str:

@@ -61,6 +61,8 @@ class _MapAttack(Attack):
 class ShiftedMap(_MapAttack):
     """The whole map jumps by three metres."""
 
+    is_detectable = False  # it is the same map at another place: what an honest filter draws when it changes its mind
+
     def change(self, grid: OccupancyGrid, age_s: float) -> OccupancyGrid:
         return replace(grid, origin=grid.origin @ SE2(3.0, -3.0, 0.0))
 
@@ -88,6 +90,8 @@ class AllOccupied(_MapAttack):
 
 class DriftingMap(_MapAttack):
     """The map creeps away, ten centimetres a second."""
+
+    is_detectable = False  # the same map, a little elsewhere
 
     def change(self, grid: OccupancyGrid, age_s: float) -> OccupancyGrid:
         steps = int(0.1 * age_s / grid.resolution_m)
