@@ -49,18 +49,20 @@ class SerialPort:
     def __init__(self, path: str, baud: int, open_dtr: bool | None = None) -> None:
         self.path = path
         self.has_modem_lines = True
+        is_file = "://" not in path
         try:
-            self._serial = serial.serial_for_url(path, baudrate=baud, timeout=0.05, write_timeout=1.0, do_not_open=True)
+            self._serial = serial.serial_for_url(path, baudrate=baud, timeout=0.05, do_not_open=True)
+            if is_file:  # rfc2217:// knows no such thing
+                self._serial.write_timeout = 1.0
             if open_dtr is not None:
                 self._serial.dtr = open_dtr
-            if hasattr(self._serial, "exclusive") and "://" not in path:
+            if is_file and hasattr(self._serial, "exclusive"):
                 self._serial.exclusive = True
             self._serial.open()
         except ValueError as error:
             raise DeviceConfigError(f"{path}: {error}") from error
         except GONE as error:
             raise DeviceAbsent(why_not_open(path, error)) from error
-        is_file = "://" not in path
         self._fd: int | None = self._serial.fileno() if is_file else None
         with contextlib.suppress(*GONE, ValueError, NotImplementedError, AttributeError):
             self._serial.set_low_latency_mode(True)  # FTDI waits 16 ms otherwise; a pty refuses

@@ -94,6 +94,13 @@ class RplidarSim:
         self._is_first = False
         self._held: tuple[int, list[int]] | None = None  # an ultra capsule waits for the first beam of the next
         self._booted_s = 0.0
+        self._is_turning = True  # a pseudo-terminal has no line that could stop the motor
+
+    def set_lines(self, dtr: bool, rts: bool, now_s: float) -> None:
+        """Modem lines of the adapter, where there are any: DTR raised stops the motor."""
+        if self._head is not None and self._is_turning == dtr:
+            self._head.restart(now_s)
+        self._is_turning = not dtr
 
     def fault(self, kind: str, value: float, now_s: float) -> None:
         """Misbehave: `health` (protection stop until reset), `shift` (turns that are missing or come again), `reboot`."""
@@ -180,7 +187,7 @@ class RplidarSim:
         """See `ByteDevice`."""
         out = bytes(self._outbox)
         self._outbox.clear()
-        if self._mode is None or self._head is None or not (parts := self._head.due(now_s)):
+        if not self._is_turning or self._mode is None or self._head is None or not (parts := self._head.due(now_s)):
             return out
         index, times_s, cuts = joined(parts)
         turn_deg = index * 360.0 / self._head.beams_per_turn
