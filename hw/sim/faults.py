@@ -8,7 +8,7 @@ Seconds count from the moment the device is served.  What a kind means, and its 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -117,6 +117,14 @@ class FaultyDevice:
     def inject(self, kind: str, value: float | None = None) -> None:
         """A fault that is due now; for tests that wait for something first."""
         self._pending.insert(0, Fault(kind, -math.inf, KINDS[kind][0] if value is None else value))
+
+    def relieve(self) -> None:
+        """What lasts, ends now: silence, an empty socket, noise."""
+        self._until_s = dict.fromkeys(_SPANS, -math.inf)
+
+    def wear(self, flip_share: float) -> None:
+        """From now on this share of the bytes has a turned bit."""
+        self._schedule = replace(self._schedule, flip_share=flip_share)
 
     def receive(self, data: bytes, now_s: float) -> None:
         """See `ByteDevice`."""

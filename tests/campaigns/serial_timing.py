@@ -21,7 +21,7 @@ from pathlib import Path
 from hw.device import open_lidar
 from hw.health import DeviceHealth, DeviceState
 from hw.supervisor import Device
-from tests.harness.pty_lidar import PtyLidar
+from tests.harness.serial_device import SerialDevice
 
 BARS = {"stall noticed": 0.5, "stream back": 2.0, "unplug noticed": 0.2, "back after replug": 1.0}
 
@@ -49,35 +49,33 @@ def main() -> int:
 def measure(rounds: int, rng: random.Random) -> dict[str, list[float]]:
     """So many stalls and pulled cables."""
     times: dict[str, list[float]] = {name: [] for name in BARS}
-    with tempfile.TemporaryDirectory() as folder:
-        lidar = PtyLidar(Path(folder) / "lidar")
-        device = open_lidar(f"ld06:{lidar.link}")
+    with tempfile.TemporaryDirectory() as folder, SerialDevice("ld06", Path(folder) / "lidar") as lidar:
+        device = open_lidar(lidar.url)
         assert isinstance(device, Device)
         with device:
             until(device, lambda h: h.readings >= 5)
             for _ in range(rounds):
                 _stall(device, lidar, rng, times)
                 _unplug(device, lidar, rng, times)
-        lidar.close()
     return times
 
 
-def _stall(device: Device, lidar: PtyLidar, rng: random.Random, times: dict[str, list[float]]) -> None:
+def _stall(device: Device, lidar: SerialDevice, rng: random.Random, times: dict[str, list[float]]) -> None:
     stalls = device.health().stalls
-    lidar.is_silent = True
+    lidar.silence()
     times["stall noticed"].append(until(device, lambda h: h.stalls > stalls))
     time.sleep(rng.uniform(0.2, 4.0))
-    lidar.is_silent = False
+    lidar.relieve()
     times["stream back"].append(_next_scan(device))
     until(device, lambda h: h.state is DeviceState.RUNNING)
 
 
-def _unplug(device: Device, lidar: PtyLidar, rng: random.Random, times: dict[str, list[float]]) -> None:
+def _unplug(device: Device, lidar: SerialDevice, rng: random.Random, times: dict[str, list[float]]) -> None:
     lidar.pull()
     times["unplug noticed"].append(until(device, lambda h: h.state is DeviceState.DISCONNECTED))
     time.sleep(rng.uniform(0.2, 4.0))
     spare = os.openpty()
-    lidar.plug_in()
+    lidar.relieve()
     times["back after replug"].append(_next_scan(device))
     for fd in spare:
         os.close(fd)

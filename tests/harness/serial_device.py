@@ -3,6 +3,7 @@
     with SerialDevice("ld06", tmp_path / "lidar", "stall@2:1,unplug@5:1", seed=7) as device:
         ... open_lidar(device.url) ...
         device.inject("drop", 30)              a fault now
+        device.silence(); device.pull()        until device.relieve()
         device.steal()                         a second program reads from the same port
         device.path()                          the pts behind the link: another one after a replug
 
@@ -30,6 +31,7 @@ from protocol.geometry import SE2
 
 ROOM = World.parse("0 0 4.1 0\n4.1 0 4.1 3.3\n4.1 3.3 0.6 3.3\n0.6 3.3 0 2.6\n0 2.6 0 0\n2.8 2.0 3.2 2.0\n3.2 2 3 2.3", "room")
 POSE = SE2(1.3, 1.1, math.radians(35))
+FOR_EVER_S = 1e8
 
 
 class SerialDevice:
@@ -63,6 +65,22 @@ class SerialDevice:
     def inject(self, kind: str, value: float | None = None) -> None:
         """A fault that is due now."""
         self.faulty.inject(kind, value)
+
+    def silence(self) -> None:
+        """It says nothing, until `relieve`."""
+        self.inject("stall", FOR_EVER_S)
+
+    def pull(self) -> None:
+        """Its cable is out, until `relieve`; then it is plugged in elsewhere."""
+        self.inject("unplug", FOR_EVER_S)
+
+    def relieve(self) -> None:
+        """It speaks, and is plugged in."""
+        self.faulty.relieve()
+
+    def wear(self, flip_share: float) -> None:
+        """From now on this share of its bytes has a turned bit."""
+        self.faulty.wear(flip_share)
 
     def did(self, kind: str) -> int:
         """How often a kind of fault has happened."""

@@ -15,19 +15,19 @@ from hw.health import DeviceHealth, DeviceState
 from hw.ld06 import Ld06
 from hw.readings import Odometry
 from hw.supervisor import Device
-from tests.harness.pty_lidar import LD06, PtyLidar
+from tests.harness.lidar_streams import STREAMS
+from tests.harness.serial_device import SerialDevice
 from tests.harness.talking_port import TalkingPort
 
 
 @pytest.fixture
-def lidar(tmp_path: Path) -> Iterator[PtyLidar]:
-    lidar = PtyLidar(tmp_path / "lidar")
-    yield lidar
-    lidar.close()
+def lidar(tmp_path: Path) -> Iterator[SerialDevice]:
+    with SerialDevice("ld06", tmp_path / "lidar") as lidar:
+        yield lidar
 
 
 @pytest.fixture
-def device(lidar: PtyLidar) -> Iterator[Device]:
+def device(lidar: SerialDevice) -> Iterator[Device]:
     device = open_lidar(f"ld06:{lidar.link}")
     assert isinstance(device, Device)
     device.start()
@@ -53,34 +53,34 @@ def _next_reading(device: Device, seconds: float = 5.0) -> float:
     return time.monotonic() - begin_s
 
 
-def test_a_running_device_says_how_it_is(device: Device, lidar: PtyLidar) -> None:
+def test_a_running_device_says_how_it_is(device: Device, lidar: SerialDevice) -> None:
     _until(device, lambda h: h.readings >= 8)
     health = device.health()
     assert health.state is DeviceState.RUNNING
     assert (health.port, health.model, health.points, health.baud) == (str(lidar.link), "LD06", 450, 230400)
     assert health.coverage == pytest.approx(1.0, abs=0.01)
     assert health.rate_hz == pytest.approx(10.0, rel=0.3)
-    assert health.bytes_per_s == pytest.approx(LD06.bytes_per_s, rel=0.5)
+    assert health.bytes_per_s == pytest.approx(17600, rel=0.5)
 
 
-def test_a_stall_is_noticed_and_the_stream_is_taken_up_again(device: Device, lidar: PtyLidar) -> None:
-    lidar.is_silent = True
+def test_a_stall_is_noticed_and_the_stream_is_taken_up_again(device: Device, lidar: SerialDevice) -> None:
+    lidar.silence()
     noticed_s = _until(device, lambda h: h.stalls >= 1)
     assert noticed_s < 1.0  # 0.4 s on a quiet machine: tests/campaigns/serial_timing.py
     assert "stands still" in device.health().last_error
     _until(device, lambda h: h.stalls >= 2)  # it was opened anew in the meantime
-    lidar.is_silent = False
+    lidar.relieve()
     assert _next_reading(device) < 2.0
     _until(device, lambda h: h.state is DeviceState.RUNNING)
 
 
-def test_a_pulled_cable_is_noticed_at_once_and_found_at_another_pts(device: Device, lidar: PtyLidar) -> None:
+def test_a_pulled_cable_is_noticed_at_once_and_found_at_another_pts(device: Device, lidar: SerialDevice) -> None:
     lidar.pull()
     assert _until(device, lambda h: h.state is DeviceState.DISCONNECTED) < 0.5
     time_gone_s = _until(device, lambda h: "no such port" in h.last_error)
     assert time_gone_s < 1.0
     spare = os.openpty()  # so that the pty comes back under another number
-    lidar.plug_in()
+    lidar.relieve()
     assert _next_reading(device) < 1.5
     assert device.health().reconnects >= 1
     for fd in spare:
@@ -94,23 +94,21 @@ def test_a_device_that_is_not_there_yet_is_waited_for(tmp_path: Path) -> None:
     try:
         assert device.read(0.3) is None
         assert device.health().last_error.startswith(f"ld06:{link}: no such port")
-        lidar = PtyLidar(link)
-        assert device.read(3.0) is not None
-        lidar.close()
+        with SerialDevice("ld06", link):
+            assert device.read(3.0) is not None
     finally:
         device.stop()
 
 
-def test_a_bad_line_is_degraded_and_said(device: Device, lidar: PtyLidar) -> None:
-    counter = iter(range(10**9))
-    lidar.mangle = lambda data: bytes(b ^ 0x10 if next(counter) % 400 == 0 else b for b in data)
+def test_a_bad_line_is_degraded_and_said(device: Device, lidar: SerialDevice) -> None:
+    lidar.wear(1 / 400)
     _until(device, lambda h: h.state is DeviceState.DEGRADED)
     _until(device, lambda h: "frames are damaged" in h.last_error)
-    lidar.mangle = bytes
+    lidar.wear(0.0)
     _until(device, lambda h: h.state is DeviceState.RUNNING)
 
 
-def test_another_device_on_the_port_is_told_from_a_silent_one(lidar: PtyLidar) -> None:
+def test_another_device_on_the_port_is_told_from_a_silent_one(lidar: SerialDevice) -> None:
     device = open_lidar(f"xv11:{lidar.link}").start()
     assert isinstance(device, Device)
     try:
@@ -120,7 +118,7 @@ def test_another_device_on_the_port_is_told_from_a_silent_one(lidar: PtyLidar) -
         device.stop()
 
 
-def test_stopping_is_prompt_in_every_state(lidar: PtyLidar, tmp_path: Path) -> None:
+def test_stopping_is_prompt_in_every_state(lidar: SerialDevice, tmp_path: Path) -> None:
     for url, seconds in ((f"ld06:{lidar.link}", 0.4), (f"rplidar:{lidar.link}", 0.3), (f"ld06:{tmp_path}/none", 0.2)):
         device = open_lidar(url).start()
         device.read(seconds)
@@ -130,7 +128,7 @@ def test_stopping_is_prompt_in_every_state(lidar: PtyLidar, tmp_path: Path) -> N
         assert device.health().state is DeviceState.DISCONNECTED
 
 
-def test_a_second_opener_is_told_who_has_the_port(device: Device, lidar: PtyLidar) -> None:
+def test_a_second_opener_is_told_who_has_the_port(device: Device, lidar: SerialDevice) -> None:
     second = open_lidar(f"ld06:{lidar.link}").start()
     assert isinstance(second, Device)
     try:
@@ -173,9 +171,10 @@ class _Broken(Ld06):
         raise ZeroDivisionError("a bug")
 
 
-def test_a_bug_in_a_driver_is_said_and_survived(lidar: PtyLidar) -> None:
+def test_a_bug_in_a_driver_is_said_and_survived(lidar: SerialDevice) -> None:
     port = TalkingPort()
-    port.stream(LD06.data, LD06.bytes_per_s)
+    stream = STREAMS["ld06"](seconds=3.0)
+    port.stream(stream.data, stream.bytes_per_s)
     device = Device("ld06:test", _Broken(), port.open).start()
     try:
         _until(device, lambda h: "please report" in h.last_error and h.reconnects >= 2)

@@ -10,37 +10,38 @@ import cv2
 import pytest
 
 from agent.cli import main
-from tests.harness.pty_lidar import PtyLidar
+from tests.harness.serial_device import SerialDevice
 
 
 @pytest.fixture
-def lidar(tmp_path: Path) -> Iterator[PtyLidar]:
-    lidar = PtyLidar(tmp_path / "lidar")
-    yield lidar
-    lidar.close()
+def lidar(tmp_path: Path) -> Iterator[SerialDevice]:
+    with SerialDevice("ld06", tmp_path / "lidar") as lidar:
+        yield lidar
 
 
-def test_scan_tells_figures_and_draws_what_it_sees(lidar: PtyLidar, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_scan_tells_figures_and_draws_what_it_sees(
+    lidar: SerialDevice, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     picture = tmp_path / "scan.png"
     assert main(["scan", f"ld06:{lidar.link}", "-n", "3", "--json", "--png", str(picture)]) == 0
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert len(lines) == 3
     assert lines[-1]["points"] == 450 and lines[-1]["valid"] == 450 and not lines[-1]["is_partial"]
-    assert (lines[-1]["nearest_m"], sum(lines[-1]["histogram"])) == (1.704, 450)
+    assert (lines[-1]["nearest_m"], sum(lines[-1]["histogram"])) == (1.1, 450)  # it stands 1.1 m from the lower wall
     image = cv2.imread(str(picture))
     assert image.shape == (800, 800, 3)
-    middle, wall = image[400, 400].tolist(), image[300:500, 560:600]  # the room's right wall is 2.5 m away
+    middle = image[400, 400].tolist()
     assert middle[2] > 150 and middle[1] < 90, "the sensor is drawn red in the middle"
-    assert (wall.min(axis=2) < 60).any(), "a wall is drawn dark"
+    assert (image.max(axis=2) < 90).sum() > 400, "walls are drawn dark"
 
 
-def test_a_person_gets_one_line_a_second(lidar: PtyLidar, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_person_gets_one_line_a_second(lidar: SerialDevice, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["scan", f"ld06:{lidar.link}", "-n", "3"]) == 0
     out = capsys.readouterr().out
     assert "LD06" in out and "450 points" in out and "100% of the circle" in out
 
 
-def test_record_and_replay(lidar: PtyLidar, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_record_and_replay(lidar: SerialDevice, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "a.rec"
     assert main(["record", f"ld06:{lidar.link}", str(file), "--seconds", "1.2"]) == 0
     assert "readings" in capsys.readouterr().err
@@ -49,7 +50,7 @@ def test_record_and_replay(lidar: PtyLidar, tmp_path: Path, capsys: pytest.Captu
     assert len(lines) >= 4 and lines[0]["points"] == 450
 
 
-def test_devices_says_who_answers(lidar: PtyLidar, capsys: pytest.CaptureFixture[str]) -> None:
+def test_devices_says_who_answers(lidar: SerialDevice, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["devices", "--probe", "--json", "--as", "ld06", str(lidar.link)]) == 0
     found = json.loads(capsys.readouterr().out)
     assert (found[0]["url"], found[0]["kind"], found[0]["model"]) == (f"ld06:{lidar.link}", "lidar", "LD06")
