@@ -21,6 +21,7 @@ from agent.fleet.fetching import Fetching
 from agent.fleet.inbox import Inbox
 from agent.fleet.ledger import Ledger
 from agent.fleet.members import Peer
+from agent.fleet.memory import FleetMemory
 from agent.fleet.options import FleetOptions
 from agent.fleet.overview import Overview
 from agent.fleet.own_words import OwnWords
@@ -197,6 +198,19 @@ class Coordinator:
             self._ledger.judge_all(peer, now_s)
             self._ledger.lay_out(now_s)
         return self._done()
+
+    def memory(self) -> FleetMemory:
+        """What to keep over a restart; see `recall`."""
+        ledger = self._ledger
+        places = {e.other(self.robot): ledger.from_our_side(e) for key, e in ledger.live.items() if self.robot in key}
+        unmerged = tuple(sorted(peer.robot for peer in ledger.peers.values() if peer.is_unmerged))
+        return FleetMemory(self._words.epoch, {**self._pairs.words.remembered, **places}, unmerged)
+
+    def recall(self, memory: FleetMemory) -> None:
+        """At the start: verify these transforms before anything is searched for."""
+        self._pairs.words.remembered = dict(memory.T_ours_theirs)
+        self._words.recalled_epoch = memory.epoch
+        self._ledger.roster.unmerged = set(memory.unmerged)
 
     def register(self, key: str) -> bytes | None:
         """The encoded answer to a query on our subtree, at most 16 KB; None: there is no such register."""

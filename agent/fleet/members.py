@@ -116,6 +116,7 @@ class Roster:
         self.peers: dict[str, Peer] = {}
         self.restarted: list[str] = []  # robots whose boot changed since this list was emptied
         self.joined: list[str] = []
+        self.unmerged: set[str] = set()  # by the operator, in a life before
         self.twins: list[str] = []  # robots of which two lives speak at once
 
     def hear(self, message: Message, now_s: float) -> Peer | None:
@@ -125,6 +126,7 @@ class Roster:
             if len(self.peers) >= self._options.max_peers and not self._make_room():
                 return None
             peer = self.peers[message.robot] = Peer(message.robot, message.boot, now_s, now_s)
+            peer.is_unmerged = message.robot in self.unmerged
             self.joined.append(peer.robot)
         if message.boot != peer.boot:
             if message.boot in peer.ghosts:

@@ -28,6 +28,8 @@ class OwnWords:
         self._latest: tuple[OccupancyGrid, FeatureMap, int] | None = None  # not yet published
         self._announced_m2 = 0.0
         self._beat_seq = 0
+        self.epoch = 0  # of the map we published last
+        self.recalled_epoch: int | None = None  # of the map that remembered transforms are about
         self.T_map_robot: SE2 | None = None
 
     def take_map(self, grid: OccupancyGrid, features: FeatureMap, epoch: int, now_s: float) -> None:
@@ -42,6 +44,9 @@ class OwnWords:
         (grid, features, epoch), self._latest = self._latest, None
         own = self._ledger.own
         before = own.version
+        if self.recalled_epoch not in (None, epoch):
+            self._pairs.words.remembered, self.recalled_epoch = {}, None
+        self.epoch = epoch
         if not own.publish(grid, features, frame_id(self._ledger.robot, self._ledger.boot, epoch)):
             return
         self._ledger.timetable.next_announce_s = now_s + self._ledger.options.announce_period_s

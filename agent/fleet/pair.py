@@ -35,7 +35,6 @@ class Pair:
     """Our side of one pair."""
 
     peer: str
-    boot: int = 0  # of the peer, when we spoke about the pair last
     phase: str = "unseen"
     reason: str = ""
     attempts: int = 0

@@ -93,7 +93,7 @@ class PairChoice:
 
     def _approach(self, pair: Pair, peer: Peer, now_s: float) -> Due | None:
         """A stranger: the coarse map first, the cells when that looks hopeful, then the search."""
-        options = self._ledger.options
+        options, hint = self._ledger.options, self._words.hint(peer.robot)
         if peer.is_in_frame:
             if not self._is_due(pair.search, self._ledger.own.known_area_m2 + peer.known_area_m2, peer.map, now_s):
                 return None
@@ -101,11 +101,11 @@ class PairChoice:
                 pair.wants_fine = True  # grown since: search on the newest
                 if not self._is_due(pair.search, self.area_m2(peer), peer.held, now_s):
                     return None
-            return Due(Purpose.HINT, None, pair.hint) if pair.hint else Due(Purpose.SEARCH)
+            return Due(Purpose.HINT, None, hint) if hint else Due(Purpose.SEARCH)
         announced = peer.announcement
         if announced is None or not self._may_court(pair):
             return None
-        if announced.fine_bytes <= options.coarse_skip_bytes or pair.phase == "hopeful" or pair.coarse_misses >= 3:
+        if hint or announced.fine_bytes <= options.coarse_skip_bytes or pair.phase == "hopeful" or pair.coarse_misses >= 3:
             pair.wants_fine = True
             return None
         if not self._is_due(pair.coarse, self._ledger.own.known_area_m2 + peer.known_area_m2, peer.map, now_s):
@@ -161,8 +161,8 @@ class PairChoice:
         return said.evidence.id() == mine.evidence.id()
 
     def _may_propose(self, peer: Peer) -> bool:
-        """The smaller id searches; the larger one only while the smaller is silent."""
-        return self._ledger.robot < peer.robot or peer.presence is Presence.LOST
+        """The smaller id searches; the larger one only while the smaller is silent, or when it remembers where that was."""
+        return self._ledger.robot < peer.robot or peer.presence is Presence.LOST or peer.robot in self._words.remembered
 
     def _is_recheck_due(self, pair: Pair, peer: Peer, now_s: float) -> bool:
         own = self._ledger.own.version

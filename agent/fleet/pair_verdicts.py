@@ -41,7 +41,7 @@ class PairVerdicts:
 
     def _on_found(self, pair: Pair, running: Running, result: MergeResult, attempt: Attempt) -> None:
         if running.purpose is Purpose.HINT:
-            pair.hint = None  # once: if it does not hold, the search starts afresh
+            self._words.forget_hint(pair.peer)  # once: if it does not hold, the search starts afresh
         elif running.purpose is Purpose.LOOP:
             pair.loop = attempt
         if running.purpose is Purpose.SEARCH or result.accepted:
@@ -91,7 +91,8 @@ class PairVerdicts:
 
     def _found_good(self, pair: Pair, peer: Peer, running: Running, result: MergeResult, now_s: float) -> None:
         """The transform holds on these very maps: they may enter the global map."""
-        pair.failures, pair.is_urgent, pair.phase, pair.hint = 0, False, "merged", None
+        pair.failures, pair.is_urgent, pair.phase = 0, False, "merged"
+        self._words.forget_hint(pair.peer)
         pair.checked = Attempt(now_s, running.area_m2)
         pair.checked_digests = (running.ours.digest, running.theirs.digest)
         T = result.T_ours_theirs

@@ -9,6 +9,7 @@ from __future__ import annotations
 from agent.fleet.ledger import Ledger, supported
 from agent.fleet.members import Peer
 from agent.fleet.pair import Attempt, Pair
+from protocol.geometry import SE2
 from protocol.messages import NO_DIGEST, Evidence, Stance, Statement
 
 
@@ -18,9 +19,18 @@ class PairWords:
     def __init__(self, ledger: Ledger) -> None:
         self._ledger = ledger
         self.pairs: dict[str, Pair] = {}
+        self.remembered: dict[str, SE2] = {}  # T_ours_theirs of a life before: tried once, then forgotten
 
     def pair(self, peer: str) -> Pair:
         return self.pairs.setdefault(peer, Pair(peer))
+
+    def hint(self, peer: str) -> SE2 | None:
+        """Where this peer's map lay on ours before one of them was begun or read anew."""
+        return self.pair(peer).hint or self.remembered.get(peer)
+
+    def forget_hint(self, peer: str) -> None:
+        self.pair(peer).hint = None
+        self.remembered.pop(peer, None)
 
     def say(self, other: str, stance: Stance, evidence: Evidence, holds: bytes, reason: str) -> None:
         """Change our statement about a pair, and publish it."""
@@ -30,7 +40,6 @@ class PairWords:
         readable = "".join(c for c in reason if c.isprintable())[:80]
         statement = Statement(ledger.robot, ledger.boot, ledger.seq, other, stance, evidence, holds, readable)
         ledger.mine[other] = statement
-        self.pair(other).boot = ledger.peers[other].boot
         ledger.send(statement)
 
     def withdraw(self, other: str, reason: str, now_s: float) -> None:
@@ -78,8 +87,7 @@ class PairWords:
             pair = self.pairs[other] = Pair(other, attempts=old.attempts)
             if mine is None:
                 continue
-            peer = self._ledger.peers.get(other)
-            if mine.stance in (Stance.PROPOSE, Stance.ACK) and peer is not None and peer.boot == old.boot:
+            if mine.stance in (Stance.PROPOSE, Stance.ACK):
                 pair.hint = self._ledger.from_our_side(mine.evidence)
             del self._ledger.mine[other]
             self._ledger.seq += 1

@@ -205,6 +205,13 @@ class FleetWorker:
         if self._on_note is not None:
             self._on_note(note)
 
+    # For the disk.
+
+    def memory(self) -> bytes:
+        """What a next life should know of this one."""
+        with self._turn:
+            return self._coordinator.memory().encode()
+
     # For people.
 
     def state(self) -> FleetState:

@@ -33,6 +33,7 @@ STEP_S = 0.5
 REOPEN_AFTER_S = 20.0  # stalls of 10 s are normal and mean nothing
 REOPEN_AT_MOST_EVERY_S = 300.0
 CHECKPOINT_WITHIN_S = 1.0
+MEMORY_EVERY_S = 2.0  # a transform that is refined all the time does not wear the disk out
 OPEN_EVERY_S = 2.0  # a client looks for its router this often
 
 
@@ -43,6 +44,7 @@ class Keeper:
         self._node = node
         self._checkpoints: Latest[bytes] = Latest()
         self._next_save_s = time.monotonic() + node.config.state.save_every_s
+        self._memory, self._memory_s = b"", time.monotonic()
         self._wait = threading.Event()
         self._silent_since_s: float | None = None
         self._reopen_after_s = REOPEN_AFTER_S
@@ -60,6 +62,7 @@ class Keeper:
         self.links = node.fleet.exchange.links()
         self._watch_links()
         self.save_checkpoint()
+        self._save_memory(node.fleet.memory(), MEMORY_EVERY_S)
         if node.state is not None and time.monotonic() >= self._next_save_s:
             self._next_save_s = time.monotonic() + node.config.state.save_every_s
             self.ask_for_checkpoint()
@@ -74,9 +77,18 @@ class Keeper:
         if checkpoint is not None and self._node.state is not None:
             self._node.state.save("mapper", checkpoint)
 
+    def _save_memory(self, memory: bytes, every_s: float) -> None:
+        """Where the others lie on our map: small, and written whenever it is another."""
+        state, now_s = self._node.state, time.monotonic()
+        if state is not None and memory != self._memory and now_s - self._memory_s >= every_s:
+            self._memory_s = now_s
+            if state.save("fleet", memory):
+                self._memory = memory
+
     def save_now(self) -> None:
         """When stopping: the map worker has ended, so its mapper may be read here."""
         node = self._node
+        self._save_memory(node.fleet.memory(), 0.0)
         if node.state is not None and node.map.scans:
             node.state.save("mapper", node.map.mapper.checkpoint())
 

@@ -28,6 +28,7 @@ from typing import Any
 from agent.config import Config
 from agent.features.snapshot import MapSnapshot
 from agent.fleet.coordinator import Coordinator
+from agent.fleet.memory import FleetMemory, decode_memory
 from agent.fleet.options import FleetOptions
 from agent.mapping.mapper import Mapper
 from agent.mapping.options import MappingOptions
@@ -83,6 +84,7 @@ class Node:
         self.merger = MergeWorker(match_options(config), pace)
         options = FleetOptions(min_match_factor=config.matching.min_match_factor)
         coordinator = Coordinator(self.robot, self.boot_id, options)
+        coordinator.recall(decode_memory((self.state and self.state.load("fleet")) or b"") or FleetMemory())
         settings = network_settings(config)
         guard = guard_for(settings, self.boot_id)
         self.fleet = FleetWorker(
@@ -198,6 +200,7 @@ class Node:
             self.map.mapper.epoch = epoch
             if self.state is not None:
                 self.state.forget("mapper")
+                self.state.forget("fleet")
 
         self.map.call(begin)
 

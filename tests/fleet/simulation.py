@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from agent.fleet.consistency import agreement
 from agent.fleet.coordinator import Coordinator
 from agent.fleet.effects import Changed, Effect, Fetch, Fuse, Match, MatchKind, Note, Send
+from agent.fleet.memory import FleetMemory
 from agent.fleet.options import FleetOptions
 from agent.merging.fusion import FusedMap, fuse
 from agent.merging.result import MatchFactor, MatchStatus, MergeResult
@@ -180,9 +181,11 @@ class Fleet:
         self.start(node)
         return node
 
-    def start(self, node: Node) -> None:
+    def start(self, node: Node, memory: FleetMemory | None = None) -> None:
         node.life += 1
         node.coordinator = Coordinator(node.robot, self.rng.getrandbits(64), node.options)
+        if memory is not None:
+            node.coordinator.recall(memory)
         node.global_map = None
         if node.explorer is not None:
             self.share_map(node)
