@@ -65,7 +65,8 @@ def _settled(points: NDArray[np.float64], radius_m: float) -> NDArray[np.float64
         for _ in range(_SHIFTS):
             sums = _within(local, centres[mine], radius_m).astype(np.float32) @ weighed
             centres[mine] = sums[:, :2] / np.maximum(sums[:, 2:], 1.0)
-    return centres + middle
+    settled: NDArray[np.float64] = centres + middle
+    return settled
 
 
 def _within(points: NDArray[np.floating], centres: NDArray[np.floating], radius_m: float) -> NDArray[np.bool_]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,7 @@ REACHES_M = (0.5, 1.2, 3.0)  # how far apart the three cells may lie: pillars, c
 TRIES = 2  # of the hypotheses, refined
 MAX_PIECES = 100  # the largest
 MAX_PIECE_CELLS = 600
+KEPT_PIECES = 256  # at most 2.5 MB
 MAX_PER_PIECE = 4
 MAX_ARCS = 64
 INDEPENDENT_M = 0.3  # cells closer than this do not err independently
@@ -66,11 +68,11 @@ def find_arcs(points_m: NDArray[np.float64], piece: NDArray[np.int64], resolutio
     order = np.argsort(piece, kind="stable")
     starts = np.concatenate([[0], np.cumsum(sizes)])
     largest = [i for i in np.argsort(-sizes, kind="stable")[:MAX_PIECES].tolist() if sizes[i] >= MIN_CELLS]
-    arcs = []
+    arcs: list[Arc] = []
     for i in largest:
         rows = order[starts[i] : starts[i + 1]]
         stride = -(-len(rows) // MAX_PIECE_CELLS)
-        arcs += _arcs_of_piece(points_m[rows[::stride]], resolution_m, stride)
+        arcs += _arcs_of_piece(points_m[rows[::stride]].tobytes(), resolution_m, stride)
     return sorted(arcs, key=lambda arc: -arc.radius_m * arc.span_rad)[:MAX_ARCS]
 
 
@@ -84,8 +86,13 @@ def as_tables(arcs: list[Arc]) -> tuple[NDArray[np.float32], NDArray[np.float32]
     )
 
 
-def _arcs_of_piece(points: NDArray[np.float64], cell_m: float, stride: int) -> list[Arc]:
-    """The arcs of one piece, of whose cells every `stride`-th is given."""
+@lru_cache(maxsize=KEPT_PIECES)
+def _arcs_of_piece(xy: bytes, cell_m: float, stride: int) -> tuple[Arc, ...]:
+    """The arcs of one piece, of whose cells every `stride`-th is given, as bytes of (N, 2) float64.
+
+    From one second to the next most pieces of a growing map stay as they are: theirs are remembered.
+    """
+    points = np.frombuffer(xy).reshape(-1, 2)
     found: list[Arc] = []
     while len(found) < MAX_PER_PIECE and len(points) >= MIN_CELLS:
         arc = _best_arc(points, cell_m, stride)
@@ -93,7 +100,7 @@ def _arcs_of_piece(points: NDArray[np.float64], cell_m: float, stride: int) -> l
             break
         found.append(arc)
         points = points[~arc.explains(points, cell_m)]
-    return found
+    return tuple(found)
 
 
 def _best_arc(points: NDArray[np.float64], cell_m: float, stride: int) -> Arc | None:
@@ -205,10 +212,13 @@ def _fitted(points: NDArray[np.float64], circle: NDArray[np.float64]) -> NDArray
 
 
 def _solved(A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Least squares by normal equations: three unknowns near the origin need no better, and it is five times faster."""
-    H = A.T @ A
-    H[(0, 1, 2), (0, 1, 2)] += 1e-9
-    solution: NDArray[np.float64] = np.linalg.solve(H, A.T @ b).astype(np.float64)
+    """Least squares by normal equations and Cramer's rule: three unknowns near the origin need no better."""
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = (A.T @ A + 1e-9 * np.eye(3)).tolist()
+    p, q, r = (A.T @ b).tolist()
+    c0, c1, c2 = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    c3, c4, c5 = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
+    det = xx * c0 + xy * c1 + xz * c2
+    solution: NDArray[np.float64] = np.array([c0 * p + c1 * q + c2 * r, c1 * p + c3 * q + c4 * r, c2 * p + c4 * q + c5 * r]) / det
     return solution
 
 
@@ -239,7 +249,8 @@ def _longest_run(
     if not len(breaks):
         widest = int(gaps.argmax())
         return on, float(angle[order[(widest + 1) % len(on)]]), math.tau - float(gaps[widest])
-    runs = np.split(np.roll(order, -(int(breaks[0]) + 1)), (breaks[1:] - breaks[0]))
-    longest = max(runs, key=len)
+    lengths = np.diff(np.concatenate([breaks, breaks[:1] + len(on)]))
+    k = int(lengths.argmax())
+    longest = order.take(np.arange(breaks[k] + 1, breaks[k] + 1 + lengths[k]), mode="wrap")
     start = float(angle[longest[0]])
     return on[np.sort(longest)], start, float(np.remainder(angle[longest[-1]] - start, math.tau))

@@ -105,7 +105,8 @@ def _around(grid: WorkingGrid, cells: NDArray[np.int32], offsets: NDArray[np.int
     seen = np.pad(grid.occupied[part] | (grid.free[part] << 1), ((above, below), (left, right)))
     row, col = (cells - low + reach).T
     middle = row * seen.shape[1] + col
-    return seen.ravel().take(middle[:, None] + (offsets[:, 0] * seen.shape[1] + offsets[:, 1])[None])
+    around: NDArray[np.uint8] = seen.ravel().take(middle[:, None] + (offsets[:, 0] * seen.shape[1] + offsets[:, 1])[None])
+    return around
 
 
 def _shift(
