@@ -30,6 +30,7 @@ from agent.features.snapshot import MapSnapshot
 from agent.fleet.coordinator import Coordinator
 from agent.fleet.memory import FleetMemory, decode_memory
 from agent.fleet.options import FleetOptions
+from agent.mapping.estimate import MapEstimate
 from agent.mapping.mapper import Mapper
 from agent.mapping.options import MappingOptions
 from agent.merging.result import MatchOptions
@@ -42,6 +43,7 @@ from agent.runtime.keeper import Keeper
 from agent.runtime.map_worker import MapWorker
 from agent.runtime.merge_worker import MergeWorker
 from agent.runtime.network import NetworkSettings
+from agent.runtime.own_loops import fit_in_own_map
 from agent.runtime.pace import REAL, Pace
 from agent.runtime.priors import FrozenPeer
 from agent.runtime.records import Records
@@ -74,6 +76,8 @@ class Node:
         self.robot = config.robot.id
         self.boot_id = secrets.randbits(63) if boot_id is None else boot_id
         self._pace = pace
+        self._unread: MapEstimate | None = None  # the newest map whose features were not made yet
+        self._next_features_s = 0.0
         self.started_s = time.monotonic()
         self.state = StateDirectory(state_folder) if state_folder is not None else None
         self.records = Records(state_folder / "records.jsonl" if state_folder is not None else None)
@@ -83,6 +87,7 @@ class Node:
         self.map = MapWorker(self._mapper(), self.readings, pace=pace)
         self.merger = MergeWorker(match_options(config), pace)
         options = FleetOptions(min_match_factor=config.matching.min_match_factor)
+        self._features_period_s = options.announce_period_s  # what comes sooner is not announced
         coordinator = Coordinator(self.robot, self.boot_id, options)
         coordinator.recall(decode_memory((self.state and self.state.load("fleet")) or b"") or FleetMemory())
         settings = network_settings(config)
@@ -127,19 +132,23 @@ class Node:
         saved = self.state.load("mapper") if self.state is not None else None
         if saved is not None:
             try:
-                mapper = Mapper.restore(saved, options)
+                mapper = Mapper.restore(saved, options, fit_in_own_map)
                 log.info("restored the local map of the last run bytes=%d", len(saved))
                 return mapper
             except Exception as error:  # whatever an older program wrote: a robot starts
                 log.warning("the saved map does not fit this program, starting a new one: %s", error)
-        return Mapper(options, seed=self.config.mapping.seed)
+        return Mapper(options, self.config.mapping.seed, fit_in_own_map)
 
     def _features_step(self) -> None:
+        """Where we are, as often as it is known; the map and its features, as often as they are announced."""
         estimate = self.map.estimates.take(self._pace.wait_s(0.25))
-        if estimate is None:
-            return
-        self.fleet.poses.put(estimate.T_map_robot)
-        self.fleet.local_maps.put((estimate, MapSnapshot.of(estimate.grid).features))
+        if estimate is not None:
+            self.fleet.poses.put(estimate.T_map_robot)
+            self._unread = estimate
+        if self._unread is not None and self._pace.clock() >= self._next_features_s:
+            estimate, self._unread = self._unread, None
+            self._next_features_s = self._pace.clock() + self._features_period_s
+            self.fleet.local_maps.put((estimate, MapSnapshot.of(estimate.grid).features))
 
     def __enter__(self) -> Node:
         try:
@@ -196,7 +205,7 @@ class Node:
 
         def begin() -> None:
             epoch = self.map.mapper.epoch + 1
-            self.map.mapper = Mapper(mapping_options(self.config), seed=self.config.mapping.seed)
+            self.map.mapper = Mapper(mapping_options(self.config), self.config.mapping.seed, fit_in_own_map)
             self.map.mapper.epoch = epoch
             if self.state is not None:
                 self.state.forget("mapper")
