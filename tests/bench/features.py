@@ -18,15 +18,19 @@ import cv2
 import numpy as np
 
 from agent.features.extraction import extract_features, feature_map
+from agent.features.field import MatchField
 from agent.features.lines import wall_lines
 from agent.features.paper import paper_features
+from agent.features.round_walls import _arcs_of_piece
+from agent.features.signatures import MAX_TARGETS
 from agent.features.snapshot import MapSnapshot
 from agent.features.wall_points import wall_points
 from agent.features.working import WorkingGrid
 from agent.merging.equations import FactorCounter
 from agent.merging.matched_features import matched_features
-from agent.merging.matching import match_maps
+from agent.merging.matching import match_maps, verify_match
 from agent.merging.paper import rotation_candidates, similar_features, translation_candidates
+from agent.merging.search import FIRST_PASS, search
 from protocol.features import FeatureMap
 from protocol.fields import FEATURES
 from protocol.geometry import SE2, wrap_angle
@@ -106,8 +110,12 @@ def _stages(rooms: int) -> dict[str, Any]:
         "paper_features": len(mine),
         "wall_points_ms": _ms(lambda: wall_points(working)),
         "lines_ms": _ms(lambda: wall_lines(walls, working.resolution_m)),
-        "round_and_curves_ms": _ms(lambda: feature_map(working, walls, lines, ours.origin)),
+        "round_and_curves_ms": _ms(lambda: (_arcs_of_piece.cache_clear(), feature_map(working, walls, lines, ours.origin))),
+        "field_ms": _ms(lambda: MatchField.of(working, walls)),
+        "signatures_ms": _ms(lambda: ours_kept._signatures(MAX_TARGETS)),
+        "first_pass_ms": _ms(lambda: search(ours_kept, theirs_kept, FIRST_PASS)),
         "match_ms": _ms(lambda: match_maps(ours_kept, theirs_kept)),
+        "verify_ms": _ms(lambda: verify_match(ours_kept, theirs_kept, T)),
         "match_factor_ms": _ms(lambda: counter.at(T)),
         "paper_features_ms": _ms(lambda: paper_features(ours)),
         "paper_vote_ms": _ms(lambda: [list(translation_candidates(pairs, t)) for t in rotation_candidates(pairs, 1.0)]),

@@ -6,7 +6,20 @@ import math
 from collections.abc import Mapping, Sequence
 from html import escape
 
-_COLOURS = ("#0c5fb2", "#de7012", "#147d46", "#a01c60", "#7a6a00", "#555555", "#3aa0c8")
+_COLOURS = (
+    "#0c5fb2",
+    "#de7012",
+    "#147d46",
+    "#a01c60",
+    "#7a6a00",
+    "#555555",
+    "#3aa0c8",
+    "#c03028",
+    "#6a4fc0",
+    "#2aa87a",
+    "#b07a4a",
+    "#222222",
+)
 _WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP, _RIGHT = 860, 480, 76, 56, 44, 210
 
 

@@ -2,13 +2,18 @@
 
 .venv/bin/python -m tests.bench.paper_figures            simulated pairs, and pairs of the recordings when the kit is built
 .venv/bin/python -m tests.bench.paper_figures --json     the same rows as JSON
+.venv/bin/python -m tests.bench.paper_figures --fft      the kit's exhaustive search by Fourier transform beside them
+
+The last column of the summary is CPU as a multiple of ours on the same pairs in the same run, features included.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import math
+import sys
 import time
 from collections.abc import Iterable
 from itertools import chain
@@ -20,16 +25,19 @@ import numpy as np
 from agent.features.paper import paper_features
 from agent.features.snapshot import MapSnapshot
 from agent.merging.matching import match_maps
-from agent.merging.result import MatchOptions
+from agent.merging.result import MatchOptions, MatchStatus, MergeResult
+from protocol.geometry import SE2
 from tests.bench.map_pairs import MapPair, kit_pairs, simulated_pairs
+from tests.bench.recordings import SHARED
 
-METHODS = ("paper", "paper-guarded", "hybrid")
+FFT = "fft, exhaustive"
+METHODS = ("paper", "paper-guarded", FFT, "hybrid")
 WORLDS = ["office?seed=1", "office?seed=2", "office?seed=3", "random?seed=1", "random?seed=2", "outdoor?seed=1"]
 
 
 def measured(pair: MapPair, method: str) -> dict[str, Any]:
     started = time.process_time()
-    result = match_maps(MapSnapshot.of(pair.ours), MapSnapshot.of(pair.theirs), MatchOptions(method=method))
+    result = exhaustive(pair) if method == FFT else hybrid_or_paper(pair, method)
     cpu_ms = (time.process_time() - started) * 1e3
     T = result.T_ours_theirs
     is_right = T is not None and pair.is_right(T)
@@ -49,6 +57,20 @@ def measured(pair: MapPair, method: str) -> dict[str, Any]:
         "error_deg": None if math.isnan(radians) else round(math.degrees(radians), 2),
         "cpu_ms": round(cpu_ms, 1),
     }
+
+
+def hybrid_or_paper(pair: MapPair, method: str) -> MergeResult:
+    return match_maps(MapSnapshot.of(pair.ours), MapSnapshot.of(pair.theirs), MatchOptions(method=method))
+
+
+def exhaustive(pair: MapPair) -> MergeResult:
+    """The kit's baseline; it tells neither match factor nor candidates."""
+    if str(SHARED) not in sys.path:
+        sys.path.append(str(SHARED))
+    oracle, se2 = (importlib.import_module(f"bench.{name}") for name in ("adapters.fft_oracle", "se2"))
+    accepted, T, score, _ = oracle.FftOracle()(pair.ours.cells, pair.theirs.cells, pair.ours.resolution_m)
+    T_ours_theirs = pair.ours.origin @ SE2(*se2.params(T)) @ pair.theirs.origin.inverse()
+    return MergeResult(MatchStatus.MERGED if accepted else MatchStatus.NO, T_ours_theirs, score=float(score))
 
 
 def as_markdown(rows: list[dict[str, Any]]) -> str:
@@ -73,18 +95,21 @@ def judged(row: dict[str, Any]) -> str:
 
 def summary(rows: list[dict[str, Any]]) -> str:
     lines = [
-        "| method | fitting pairs: right / wrong / not merged | strangers merged | CPU ms median (slowest tenth) |",
-        "|---|---|---|---|",
+        "| method | fitting pairs: right / wrong / not merged | strangers merged | CPU ms median (slowest tenth) | times ours |",
+        "|---|---|---|---|---|",
     ]
+    ours_ms = {r["pair"]: r["cpu_ms"] for r in rows if r["method"] == "hybrid"}
     for method in METHODS:
         mine = [r for r in rows if r["method"] == method]
+        if not mine:
+            continue
         fit, unfit = [r for r in mine if r["should_merge"]], [r for r in mine if not r["should_merge"]]
         right, wrong = (sum(judged(r) == word for r in fit) for word in ("right", "**WRONG**"))
         false = sum(r["verdict"] == "merged" for r in unfit)
-        cpu = [r["cpu_ms"] for r in mine]
+        cpu, times_ours = [r["cpu_ms"] for r in mine], [r["cpu_ms"] / ours_ms[r["pair"]] for r in mine]
         lines.append(
             f"| {method} | {right} / {wrong} / {len(fit) - right - wrong} of {len(fit)} | {false} of {len(unfit)} | "
-            f"{np.median(cpu):.0f} ({np.percentile(cpu, 90):.0f}) |"
+            f"{np.median(cpu):.0f} ({np.percentile(cpu, 90):.0f}) | {np.median(times_ours):.1f} |"
         )
     return "\n".join(lines)
 
@@ -101,9 +126,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--kit-stride", type=int, default=6, help="every N-th pair of the kit (default 6)")
+    parser.add_argument("--fft", action="store_true", help="also the exhaustive search of ../shared/bench: seconds a pair")
     args = parser.parse_args()
     cv2.setNumThreads(1)
-    rows = [measured(pair, method) for pair in all_pairs(args.kit_stride) for method in METHODS]
+    methods = [method for method in METHODS if args.fft or method != FFT]
+    rows = [measured(pair, method) for pair in all_pairs(args.kit_stride) for method in methods]
     print(json.dumps(rows, indent=1) if args.json else f"{as_markdown(rows)}\n\n{summary(rows)}")
 
 
