@@ -1,6 +1,8 @@
 """What a map says at a place, made to be asked millions of times: one byte a cell, and the index of the nearest wall point.
 
 byte  0..63   within tolerance of a wall, whose signed normal points this way (64 bins over the full turn)
+      64..127 free, where free space ends at the unknown: the way back into it.  A wall seen only along itself ends so: beams
+              passed in front of it and none hit, so a wall of the other map that faces this way is no contradiction
       254     free, and farther than the tolerance from any wall
       255     no evidence: unknown, or outside
 """
@@ -17,10 +19,12 @@ from agent.features.wall_points import WallPoints, direction_bins
 from agent.features.working import WorkingGrid
 
 DIRECTION_BINS = 64
+FIRST_EDGE_BYTE = DIRECTION_BINS
 FREE_BYTE = 254
 UNKNOWN_BYTE = 255
 FINE_TOLERANCE_M = 0.25  # a wall this near is the same wall; also what a judge calls agreement
 COARSE_TOLERANCE_M = 0.35  # for candidates that are not refined yet
+EDGE_M = 0.45  # free space this near to the unknown may end at a wall that was not hit
 REACH_M = 0.80  # refinement pulls walls together from here
 
 
@@ -34,6 +38,7 @@ class MatchField:
         np.float32
     ]  # (H, W) index of the nearest wall point, -1 beyond REACH_M; float because cv2.remap takes no int32
     distance_m: NDArray[np.float32]  # (H, W) to the nearest wall
+    wall_share: float  # of the cells that tell anything
     resolution_m: float
 
     @staticmethod
@@ -41,14 +46,30 @@ class MatchField:
         distance_m, nearest = _nearest_wall(grid, walls)
         bins = direction_bins(walls.angles_rad, DIRECTION_BINS)
         direction = bins[np.maximum(nearest, 0)] if len(walls) else np.zeros(nearest.shape, np.uint8)
-        nothing = np.where(grid.free.view(np.bool_), np.uint8(FREE_BYTE), np.uint8(UNKNOWN_BYTE))
+        no_wall = _away_from_walls(grid)
+        fine = np.where(distance_m <= max(FINE_TOLERANCE_M, 1.25 * grid.resolution_m), direction, no_wall)
         return MatchField(
-            np.where(distance_m <= max(FINE_TOLERANCE_M, 1.25 * grid.resolution_m), direction, nothing),
-            np.where(distance_m <= max(COARSE_TOLERANCE_M, 1.5 * grid.resolution_m), direction, nothing),
+            fine,
+            np.where(distance_m <= max(COARSE_TOLERANCE_M, 1.5 * grid.resolution_m), direction, no_wall),
             np.where(distance_m <= REACH_M, nearest, -1).astype(np.float32),
             distance_m,
+            int(np.count_nonzero(fine < DIRECTION_BINS)) / max(1, int(np.count_nonzero(fine != UNKNOWN_BYTE))),
             grid.resolution_m,
         )
+
+
+def _away_from_walls(grid: WorkingGrid) -> NDArray[np.uint8]:
+    """(H, W) what cells say that have no wall within tolerance."""
+    free = grid.free.view(np.bool_)
+    unknown = cv2.morphologyEx(1 - (grid.free | grid.occupied), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    side = 2 * max(1, round(EDGE_M / grid.resolution_m)) + 1
+    near = cv2.dilate(unknown, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))).view(np.bool_)
+    soft = cv2.blur(unknown.astype(np.float32), (side + 2, side + 2))
+    rows, cols = np.nonzero(near & free)
+    into_free = np.arctan2(-cv2.Sobel(soft, cv2.CV_32F, 0, 1)[rows, cols], -cv2.Sobel(soft, cv2.CV_32F, 1, 0)[rows, cols])
+    said = np.where(free, np.uint8(FREE_BYTE), np.uint8(UNKNOWN_BYTE))
+    said[rows, cols] = FIRST_EDGE_BYTE + direction_bins(into_free, DIRECTION_BINS)
+    return said
 
 
 def _nearest_wall(grid: WorkingGrid, walls: WallPoints) -> tuple[NDArray[np.float32], NDArray[np.int32]]:

@@ -17,9 +17,9 @@ from agent.merging.candidates import TARGETS_PER_QUERY, corner_candidates, signa
 from agent.merging.correlation import correlation_candidates
 from agent.merging.refinement import refined
 from agent.merging.rotations import rotation_candidates
-from agent.merging.scoring import SEARCH_WORTH, scores
+from agent.merging.scoring import scores
 from agent.merging.transforms import Poses, distinct, inverted, no_poses
-from agent.merging.views import places, probe, side
+from agent.merging.views import places, probe, search_worth, side
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,17 +27,18 @@ class Effort:
     """How many candidates each step of the funnel lets through."""
 
     rotations: int = 8  # peaks of the wall directions' correlation
-    correlated: int = 0  # of these, how many are searched by Fourier transform, with two neighbours each
+    correlated: int = 0  # of these, how many are searched by Fourier transform, with four neighbours each
     peaks: int = 20  # translations each of those yields
     scored: int = 300  # of every source, after the coarse score
     drawn: int = 60  # roughly refined
     kept: int = 20  # refined to the end
     targets: int = TARGETS_PER_QUERY  # places of ours that every telling place of theirs is laid on
+    snapped: bool = True  # signatures' rotations are those of the walls; in bent maps these err by 3 degrees
     everywhere: bool = False  # places of ours are all of its walls, not the most telling
 
 
 FIRST_PASS = Effort()  # corners and signatures: 20 ms for two cached indoor maps
-SECOND_PASS = Effort(correlated=4, drawn=100, kept=30)  # finds what the first missed in 1 pair of 50, and rivals
+SECOND_PASS = Effort(correlated=4, drawn=200, kept=40, snapped=False)  # finds what the first missed in 1 pair of 50, and rivals
 
 NEIGHBOUR_RAD = math.radians(1.2)  # peaks err by about this; correlation over a large map does not forgive it
 _ROUGH_GATES_M = (0.8, 0.6, 0.4)
@@ -64,10 +65,11 @@ def _sources(ours: MapSnapshot, theirs: MapSnapshot, effort: Effort) -> Iterator
     rotations = rotation_candidates(ours.directions, theirs.directions, effort.rotations)
     yield corner_candidates(ours.corners, theirs.corners, rotations)
     places_of_ours = ours.dense_signatures if effort.everywhere else ours.signatures
-    yield signature_candidates(places_of_ours, theirs.signatures, rotations, effort.targets)
+    snaps = rotations if effort.snapped else rotations[:0]
+    yield signature_candidates(places_of_ours, theirs.signatures, snaps, effort.targets)
     if effort.correlated and len(rotations):
         first = rotations[: effort.correlated]
-        turns = np.concatenate([rotations, first - NEIGHBOUR_RAD, first + NEIGHBOUR_RAD])
+        turns = np.concatenate([rotations, *(first + k * NEIGHBOUR_RAD for k in (-2, -1, 1, 2))])
         yield correlation_candidates(places(ours), places(theirs), turns, effort.peaks)
 
 
@@ -89,4 +91,4 @@ def _both_ways(ours: MapSnapshot, theirs: MapSnapshot, poses: Poses, field: str)
 
 def _one_way(on: MapSnapshot, points: MapSnapshot, poses: Poses, field: str, count: int) -> NDArray[np.float32]:
     image = on.field.fine if field == "fine" else on.field.coarse
-    return scores(image, on.field.resolution_m, probe(points, count), poses, SEARCH_WORTH)
+    return scores(image, on.field.resolution_m, probe(points, count), poses, search_worth(on))

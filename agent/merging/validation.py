@@ -18,24 +18,21 @@ from agent.merging.scoring import (
     CONFLICTS,
     CROSSES,
     Probe,
+    Worths,
     looked_up,
     outcome_table,
     placed,
     readings,
-    worth_table,
 )
 from agent.merging.transforms import Poses, inverted
 
 OUTCOMES = np.tile(outcome_table().ravel(), 4)
-DECISION_WORTH = worth_table(
-    (
-        (0.6, -0.05, 0.0, 0.0),  # loose
-        (1.0, -1.1, -0.7, -0.5),  # attached
-        (1.0, -1.6, -0.9, -0.5),  # short
-        (0.65, -1.9, -1.2, -0.5),  # long
-    )
+DECISION_WORTH: Worths = (
+    (0.6, -0.05, 0.0, 0.0),  # loose
+    (1.0, -1.1, -0.7, -0.5),  # attached
+    (1.0, -1.6, -0.9, -0.5),  # short
+    (0.65, -1.9, -1.2, -0.5),  # long
 )
-
 
 DEEP_M = 0.45  # a wall this far from any of theirs, in their free space, is no misalignment
 
@@ -59,6 +56,7 @@ class Witness:
     kinds: NDArray[np.uint8]
     probe: Probe
     field: MatchField
+    worth: NDArray[np.float32]  # table of `DECISION_WORTH` on this field
 
 
 def evidence(ours: Witness, theirs: Witness, poses: Poses) -> Evidence:
@@ -71,7 +69,7 @@ def evidence(ours: Witness, theirs: Witness, poses: Poses) -> Evidence:
 
 def _one_way(points: Witness, on: Witness, poses: Poses) -> tuple[NDArray[np.float64], ...]:
     index = readings(on.field.fine, on.field.resolution_m, points.probe, poses)
-    worth, outcome = DECISION_WORTH.take(index), OUTCOMES.take(index)
+    worth, outcome = on.worth.take(index), OUTCOMES.take(index)
     hit, firm = outcome == AGREES, (points.kinds != LOOSE).astype(np.float32)
     n, hits = points.thin.normals, hit.astype(np.float32)
     xx, yy, xy = hits @ (n[:, 0] ** 2), hits @ (n[:, 1] ** 2), hits @ (n[:, 0] * n[:, 1])

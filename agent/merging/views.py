@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
+
 from agent.features.snapshot import MapSnapshot
 from agent.merging.correlation import Places
 from agent.merging.refinement import Side
-from agent.merging.scoring import Probe
-from agent.merging.validation import Witness
+from agent.merging.scoring import SEARCH_WORTH, Probe, worth_table
+from agent.merging.validation import DECISION_WORTH, Witness
 
 
 def probe(snapshot: MapSnapshot, count: int) -> Probe:
@@ -22,4 +25,14 @@ def places(snapshot: MapSnapshot) -> Places:
 
 
 def witness(snapshot: MapSnapshot) -> Witness:
-    return snapshot.kept("witness", lambda s: Witness(s.thin_walls, s.thin_kinds, Probe.of(s.thin_walls, s.thin_kinds), s.field))
+    return snapshot.kept("witness", _witness)
+
+
+def search_worth(snapshot: MapSnapshot) -> NDArray[np.float32]:
+    """What wall points of another map are worth on this one, while searching."""
+    return snapshot.kept("search worth", lambda s: worth_table(SEARCH_WORTH, s.field))
+
+
+def _witness(s: MapSnapshot) -> Witness:
+    points = Probe.of(s.thin_walls, s.thin_kinds)
+    return Witness(s.thin_walls, s.thin_kinds, points, s.field, worth_table(DECISION_WORTH, s.field))
