@@ -20,6 +20,7 @@ from agent.mapping.estimate import MapEstimate
 from agent.mapping.mapper import Mapper
 from agent.mapping.options import MappingOptions
 from agent.recordings import Readings, RecordingError, open_recording
+from agent.runtime.own_loops import fit_in_own_map
 from agent.terminal import Progress
 from agent.trajectory_files import tum_text
 from agent.view.render import map_picture, pixel_of, png, scale_for
@@ -57,6 +58,7 @@ class Drawn:
     scans: int
     cpu_s: float
     begun_anew: int
+    loops_closed: int
 
 
 def run(args: argparse.Namespace) -> int:
@@ -84,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
 def draw(recording: Readings, options: MappingOptions, seed: int, *, shows_progress: bool = False) -> Drawn:
     """Feed everything to a mapper, as fast as it goes."""
     cv2.setNumThreads(1)
-    mapper = Mapper(options, seed)
+    mapper = Mapper(options, seed, fit_in_own_map)
     progress = Progress(recording.name, shown=shows_progress)
     scans, started_s = 0, time.process_time()
     for i, reading in enumerate(recording.readings):
@@ -94,8 +96,10 @@ def draw(recording: Readings, options: MappingOptions, seed: int, *, shows_progr
         scans += 1
         outcome = mapper.add_scan(reading)
         progress.at((i + 1) / len(recording.readings), outcome.status.value)
+    mapper.finish()
     progress.done()
-    return Drawn(mapper.estimate(), mapper.map.trajectory(), scans, time.process_time() - started_s, mapper.epoch)
+    cpu_s = time.process_time() - started_s
+    return Drawn(mapper.estimate(), mapper.map.trajectory(), scans, cpu_s, mapper.epoch, mapper.loops_closed)
 
 
 def write(base: Path, recording: Readings, drawn: Drawn) -> list[Path]:
@@ -130,15 +134,17 @@ def as_json(recording: Readings, drawn: Drawn) -> dict[str, float | str]:
         "height_m": round(grid.height * grid.resolution_m, 2),
         "cpu_ms_per_scan": round(1e3 * drawn.cpu_s / max(drawn.scans, 1), 3),
         "begun_anew": drawn.begun_anew,
+        "loops_closed": drawn.loops_closed,
     }
 
 
 def as_text(figures: dict[str, float | str]) -> str:
     anew = f"; the robot was lost and began a new map {figures['begun_anew']} times" if figures["begun_anew"] else ""
+    loops = f"; {figures['loops_closed']} missed loops closed" if figures["loops_closed"] else ""
     return (
         f"{figures['log']}: {figures['known_m2']} m2 known on {figures['width_m']} x {figures['height_m']} m, from"
         f" {figures['scans_placed']} of {figures['scans']} scans over {figures['distance_m']} m in {figures['duration_s']} s,"
-        f" {figures['cpu_ms_per_scan']} ms CPU a scan{anew}"
+        f" {figures['cpu_ms_per_scan']} ms CPU a scan{loops}{anew}"
     )
 
 

@@ -20,13 +20,15 @@ from numpy.typing import NDArray
 from agent.mapping.estimate import MapperStatus
 from agent.mapping.likelihood import AREA
 from agent.mapping.log_odds import LogOddsGrid
+from agent.mapping.loop_closure import LoopCloser, LoopEdge
 from agent.mapping.redrawing import Drawing, DrawnScan
+from protocol.geometry import SE2
 
 if TYPE_CHECKING:
     from agent.mapping.mapper import Mapper
 
 MAGIC = b"MQMC"
-VERSION = 1
+VERSION = 2
 LARGEST_BYTES = 1 << 30  # unpacked; a map of a square kilometre stays below
 DTYPES = {"bool", "uint8", "uint16", "int8", "int32", "int64", "float32", "float64"}
 
@@ -90,6 +92,7 @@ def state_of(mapper: Mapper) -> State:
         "resolution_m": mapper.options.resolution_m,
         "rng": mapper.rng.bit_generator.state,
         "epoch": mapper.epoch,
+        "loops_closed": mapper.loops_closed,
         "status": mapper.status.value,
         "contradictions": mapper.contradictions,
         "confirmations_missing": mapper.confirmations_missing,
@@ -109,6 +112,21 @@ def state_of(mapper: Mapper) -> State:
         **search_state(mapper),
         **filter_state(mapper),
         **drawing_state(local.drawing),
+        **loops_state(local.loops),
+    }
+
+
+def loops_state(loops: LoopCloser) -> State:
+    edges = [*loops.edges, *([] if loops.pending is None else [loops.pending])]
+    rows = [(edge.a, edge.b, edge.T_a_b.x_m, edge.T_a_b.y_m, edge.T_a_b.theta_rad) for edge in edges]
+    return {
+        "loops.edges": np.array(rows, np.float64).reshape(-1, 5),
+        "loops.is_pending": loops.pending is not None,
+        "loops.next_look": loops.next_look,
+        "loops.known": loops.known,
+        "loops.misses": loops.misses,
+        "loops.steps_from": loops.steps_from,
+        "loops.breaks": np.array(loops.breaks, np.int64),
     }
 
 
@@ -166,6 +184,8 @@ def drawing_state(drawing: Drawing) -> State:
         "drawn.is_partial": np.array([s.is_partial for s in scans], bool),
         "fresh.poses": -1 if drawing.fresh is None else len(drawing.fresh.poses),
         "fresh.target": drawing.target,
+        "fresh.is_bent": drawing.is_bending,
+        "drawn.correction": drawing.correction,
     }
 
 
@@ -202,7 +222,16 @@ def put_state(mapper: Mapper, state: State) -> None:
     local.scans = [(s, int(k), x, y, theta) for s, k, x, y, theta in state["scans"].tolist()]
     put_filter(mapper, state)
     put_drawing(local.drawing, state)
+    put_loops(local.loops, state)
+    mapper.loops_closed = state["loops_closed"]
     put_search(mapper, state)
+
+
+def put_loops(loops: LoopCloser, state: State) -> None:
+    loops.edges = [LoopEdge(int(a), int(b), SE2(x, y, theta)) for a, b, x, y, theta in state["loops.edges"].tolist()]
+    loops.pending = loops.edges.pop() if state["loops.is_pending"] else None
+    loops.next_look, loops.known, loops.misses = state["loops.next_look"], state["loops.known"], state["loops.misses"]
+    loops.steps_from, loops.breaks = state["loops.steps_from"], state["loops.breaks"].tolist()
 
 
 def put_search(mapper: Mapper, state: State) -> None:
@@ -236,7 +265,8 @@ def put_drawing(drawing: Drawing, state: State) -> None:
         points, hits = np.split(state["drawn.points_m"], ends), np.split(state["drawn.is_hit"], ends)
         drawing.scans = [DrawnScan(p, h, bool(b)) for p, h, b in zip(points, hits, state["drawn.is_partial"], strict=True)]
     if state["fresh.poses"] >= 0:
-        drawing.resume(state["fresh.target"], state["fresh.poses"])
+        drawing.resume(state["fresh.target"], state["fresh.poses"], state["fresh.is_bent"])
+    drawing.correction = state["drawn.correction"]
 
 
 def put_grid(grid: LogOddsGrid, name: str, state: State) -> None:

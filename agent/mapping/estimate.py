@@ -8,6 +8,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.mapping.loop_closure import LoopClosed
 from protocol.geometry import SE2
 from protocol.grid import OccupancyGrid
 
@@ -32,6 +33,7 @@ class ScanOutcome:
     is_keyframe: bool  # it entered the map
     fraction: float  # how much of it lies on mapped walls, 0 to 1
     reason: str = ""  # one sentence when something is not as it should be
+    loop: LoopClosed | None = None  # the map was bent until the path met itself: the pose is on the new map already
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,6 +51,7 @@ class MapEstimate:
     tile_cells: int  # side of a change tile
     first_tile: tuple[int, int]  # (row, col) of the tile at the grid's corner, in tiles from the map's origin
     tile_revisions: NDArray[np.int64]  # (rows, cols) revision that last changed each tile
+    loops_closed: int = 0  # times the map was bent, in all epochs
 
     def changed_tiles(self, since_revision: int) -> list[tuple[int, int]]:
         """(row, col) of tiles changed after a revision, counted from the map's origin: they keep their names as it grows."""

@@ -2,6 +2,7 @@
 
 track     every scan       where is the robot?                        tracking.py
 update    a keyframe       all particles; the grid of the followed    particle_filter.py, redrawing.py
+                           has a loop been missed?                    loop_closure.py
 """
 
 from __future__ import annotations
@@ -11,9 +12,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.mapping.loop_closure import FitMaps, LoopClosed, LoopCloser, apart
 from agent.mapping.motion import Motion
 from agent.mapping.options import MappingOptions
-from agent.mapping.particle_filter import ParticleFilter
+from agent.mapping.particle_filter import ParticleFilter, composed
 from agent.mapping.redrawing import Drawing
 from agent.mapping.relocalization import Relocalization
 from agent.mapping.scan_points import ScanPoints
@@ -27,10 +29,11 @@ UNKNOWN_MOTION = (0.5, 0.4)  # one sigma, metres and radians, when odometry says
 class LocalMap:
     """What one robot knows since it last began anew."""
 
-    def __init__(self, options: MappingOptions, rng: np.random.Generator) -> None:
+    def __init__(self, options: MappingOptions, rng: np.random.Generator, fit: FitMaps | None = None) -> None:
         self.options = options
         self.filter = ParticleFilter(options.particles, options.resolution_m, rng)
         self.drawing = Drawing(options)
+        self.loops = LoopCloser(fit)
         self.pose = np.zeros(3)  # T_map_robot at last_scan_s
         self.last_scan_s = math.nan
         self.keyframe_pose = np.zeros(3)  # the followed particle's pose when it last drew
@@ -101,10 +104,24 @@ class LocalMap:
         deviation_m, deviation_rad = np.sqrt(self.keyframe_variance)
         self.filter.update(motion, (float(deviation_m), float(deviation_rad)), points.surfels, points.surface_m)
         self.drawing.add(points, self.filter.line[-1])
-        self.drawing.follow(self.filter.line)
         self.keyframe_s = points.stamp_s
         self.keyframe_pose = self.filter.poses[self.filter.followed].copy()
         self.keyframe_variance = np.zeros(2)
+        bent = self.loops.look(self.drawing, self.filter.line)
+        if bent is not None:
+            self.drawing.bend(bent, self.filter.line)
+
+    def redraw(self) -> LoopClosed | None:
+        """A few scans of a drawing in progress; when a bent one is done, everything stands on it."""
+        field = self.drawing.follow(self.filter.line)
+        if field is None:
+            return None
+        before = self.pose
+        correction = self.drawing.correction
+        line = np.vstack([self.filter.line[: self.drawing.oldest], self.drawing.poses])
+        self.filter.adopt(line, field)
+        self.pose, self.keyframe_pose = (composed(correction, pose[None])[0] for pose in (self.pose, self.keyframe_pose))
+        return LoopClosed(*apart(as_pose(before), as_pose(self.pose)))
 
     def search_for(self, surfels: NDArray[np.float32], stamp_s: float) -> Relocalization:
         """A search for a scan on the whole map."""
@@ -112,6 +129,7 @@ class LocalMap:
 
     def move_to(self, pose: NDArray[np.float64], stamp_s: float) -> None:
         """The robot was found again: everything goes on from here."""
+        self.loops.breaks.append(len(self.filter.line))
         self.filter.poses = np.tile(pose, (self.filter.particles, 1))
         self.pose, self.last_scan_s = pose.copy(), stamp_s
         self.keyframe_pose, self.keyframe_s = pose.copy(), stamp_s

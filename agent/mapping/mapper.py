@@ -4,6 +4,7 @@
                where is the robot now?            local_map.py, every scan
                does what it sees contradict?      then nothing is drawn; carried away?  relocalization.py
                moved far enough?                  then, and only then, the map is updated
+               back where it once was?            then the path is bent until it meets itself   loop_closure.py
 
 A robot that finds itself nowhere on its map begins a new one, in a new frame, with the next epoch.  Readings come in order
 of time.  The same readings and the same seed give the same map, to the bit.
@@ -12,6 +13,7 @@ of time.  The same readings and the same seed give the same map, to the bit.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,6 +21,7 @@ from agent.mapping import checkpoint
 from agent.mapping.estimate import MapEstimate, MapperStatus, ScanOutcome
 from agent.mapping.local_map import LocalMap, as_pose
 from agent.mapping.log_odds import TILE_CELLS
+from agent.mapping.loop_closure import FitMaps
 from agent.mapping.motion import Motion, OdometryTrack
 from agent.mapping.options import MappingOptions
 from agent.mapping.relocalization import Relocalization
@@ -43,14 +46,16 @@ NO_WHEELS = (
 
 
 class Mapper:
-    """The map one robot draws."""
+    """The map one robot draws; `fit` is asked when it seems to be back where it was, without it no loop is closed afterwards."""
 
-    def __init__(self, options: MappingOptions, seed: int) -> None:
+    def __init__(self, options: MappingOptions, seed: int, fit: FitMaps | None = None) -> None:
         self.options = options
         self.rng = np.random.default_rng(seed)
         self.odometry = OdometryTrack(options.max_speed_m_s, options.max_turn_rad_s)
-        self.map = LocalMap(options, self.rng)
+        self.fit = fit
+        self.map = LocalMap(options, self.rng, fit)
         self.epoch = 0
+        self.loops_closed = 0
         self.status = MapperStatus.STARTING
         self.contradictions = 0  # scans in a row
         self.confirmations_missing = 0  # scans that must fit before drawing goes on
@@ -95,9 +100,11 @@ class Mapper:
         if is_keyframe:
             self.map.update(points, tracked.pose)
         self.map.accept(points.stamp_s, self.map.keyframe_pose.copy() if is_keyframe else tracked.pose)
+        loop = self.map.redraw() if is_keyframe or self.map.drawing.is_bending else None
+        self.loops_closed += loop is not None
         is_open = tracked.weakest < UNCONSTRAINED_RATIO
         status = MapperStatus.UNCONSTRAINED if is_open else MapperStatus.TRACKING
-        return self._outcome(status, is_keyframe, tracked.fraction)
+        return replace(self._outcome(status, is_keyframe, tracked.fraction), loop=loop)
 
     def _is_believable(self, points: ScanPoints, tracked: Tracked) -> bool:
         """A good fit always; a poor one when wheels vouch for the pose and the map does not rule the scan out."""
@@ -152,7 +159,7 @@ class Mapper:
 
     def _begin_anew(self, points: ScanPoints) -> ScanOutcome:
         self.epoch += 1
-        self.map = LocalMap(self.options, self.rng)
+        self.map = LocalMap(self.options, self.rng, self.fit)
         self.lost_since_s = math.nan
         self.map.start(points)
         return self._outcome(
@@ -181,6 +188,11 @@ class Mapper:
         self.status = status
         return ScanOutcome(status, as_pose(self.map.pose), is_keyframe, fraction, reason)
 
+    def finish(self) -> None:
+        """No scan will come any more: a loop that was just found is drawn to the end."""
+        while self.map.drawing.is_bending:
+            self.loops_closed += self.map.redraw() is not None
+
     def estimate(self) -> MapEstimate:
         """The map and the pose as they are now; the grid is a copy."""
         grid, stamp_s = self.map.drawing.grid, self.map.last_scan_s
@@ -198,6 +210,7 @@ class Mapper:
             tile_cells=TILE_CELLS,
             first_tile=(int(grid.first_tile[0]), int(grid.first_tile[1])),
             tile_revisions=grid.tile_revisions.copy(),
+            loops_closed=self.loops_closed,
         )
 
     def checkpoint(self) -> bytes:
@@ -205,8 +218,8 @@ class Mapper:
         return checkpoint.pack(self)
 
     @staticmethod
-    def restore(data: bytes, options: MappingOptions) -> Mapper:
+    def restore(data: bytes, options: MappingOptions, fit: FitMaps | None = None) -> Mapper:
         """The mapper of `checkpoint`; raises `CheckpointError` when the bytes or the options do not fit."""
-        mapper = Mapper(options, seed=0)
+        mapper = Mapper(options, 0, fit)
         checkpoint.unpack(data, mapper)
         return mapper

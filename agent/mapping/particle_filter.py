@@ -155,6 +155,31 @@ class ParticleFilter:
             del self.path[: KEPT_KEYFRAMES // 2], self.parents[: KEPT_KEYFRAMES // 2]
             self.forgotten += KEPT_KEYFRAMES // 2
 
+    def adopt(self, line: Poses, field: TiledFields) -> None:
+        """A loop was closed: `line` (K, 3) is what everybody remembers now, and `field`, of one particle, what they see."""
+        correction = composed(line[-1:], inverted(self.line[-1:]))
+        self.poses = composed(np.repeat(correction, self.particles, axis=0), self.poses)
+        self.line = line.copy()
+        self.path = [pose[None] for pose in line[self.forgotten :]]
+        self.parents = [np.zeros(1, np.uint16) for _ in self.path]
+        self.next_parents = np.zeros(self.particles, np.uint16)
+        self.lineage = [0] * len(line)
+        self.fields.put(np.repeat(field.tables, self.particles, axis=0), field.pool, field.first_tile)
+
+
+def composed(a: Poses, b: Poses) -> Poses:
+    """(P, 3) poses b, each in the frame of its a."""
+    out = moved(a, b)
+    out[:, 2] = (out[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
+    return out
+
+
+def inverted(poses: Poses) -> Poses:
+    """(P, 3) the frames they stand in, seen from each."""
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    x, y = poses[:, 0], poses[:, 1]
+    return np.stack([-cos * x - sin * y, sin * x - cos * y, -poses[:, 2]], axis=1)
+
 
 def moved(poses: Poses, motion: NDArray[np.float64]) -> Poses:
     """(P, 3) poses, each moved by (3,) or (P, 3) in its own frame."""

@@ -1,7 +1,8 @@
 """The grid that belongs to one particle's path, kept right when the filter changes its mind.
 
 The filter knows every particle's path; the grid is drawn for one.  When that particle turns out to remember another past
-than the one on the grid, the grid is drawn again from the kept scans, a few per call, and swapped in when done.
+than the one on the grid, the grid is drawn again from the kept scans, a few per call, and swapped in when done.  A closed
+loop bends the path of all particles: then their field is stamped again, too.
 """
 
 from __future__ import annotations
@@ -12,17 +13,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.mapping.correlation import CoarseField
+from agent.mapping.likelihood import TiledFields
 from agent.mapping.log_odds import LogOddsGrid
 from agent.mapping.options import MappingOptions
-from agent.mapping.scan_points import ScanPoints, laser_position_m
+from agent.mapping.particle_filter import FIELD_SIGMA_M, composed, inverted
+from agent.mapping.scan_matching import Poses, placed
+from agent.mapping.scan_points import ScanPoints, laser_position_m, surface_points
 from protocol.geometry import SE2
+from protocol.grid import OCCUPIED
 
 REDRAW_M = 0.05  # a past that moved by a cell is drawn again; less is left to the next time
 REDRAW_RAD = 0.01
 SCANS_A_CALL = 20  # about 10 ms at 360 beams
+BENT_SCANS_A_CALL = 40  # a bent map is wanted soon
 KEPT_SCANS = 20_000  # 4 hours of driving, 40 to 80 MB; older scans stay on the grid as they were last drawn
-
-Poses = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,6 +52,12 @@ class Drawing:
         self.fresh: Drawing | None = None  # a drawing in progress, of the first len(fresh.poses) keyframes
         self.target: Poses = np.empty((0, 3))  # where its keyframes are drawn from
         self.redrawn = 0  # times it was swapped in
+        self.field: TiledFields | None = None  # of a bent drawing: what every particle is going to see
+        self.correction: Poses = np.zeros((1, 3))  # what a bending does to keyframes that come while it is drawn
+
+    @property
+    def is_bending(self) -> bool:
+        return self.fresh is not None and self.fresh.field is not None
 
     def add(self, points: ScanPoints, pose: NDArray[np.float64]) -> None:
         """A new keyframe."""
@@ -60,38 +70,64 @@ class Drawing:
         ends = SE2(float(pose[0]), float(pose[1]), float(pose[2])).apply(scan.points_m[scan.is_hit])
         if len(ends):
             self.coarse.stamp(ends.astype(np.float32))
+        if self.field is not None and len(ends):
+            stamp_surface(self.field, self.options, scan, pose)
         self.poses = np.vstack([self.poses, pose])
 
-    def follow(self, path: Poses) -> None:
-        """Draw a few scans of what has to be drawn again so that the grid shows `path`, (K, 3) poses of all keyframes."""
-        path = path[self.oldest :]
+    def follow(self, path: Poses) -> TiledFields | None:
+        """Draw a few scans of what has to be drawn again so that the grid shows `path`, (K, 3) poses of all keyframes.
+
+        When a bent drawing is done, it is the map, `poses` is the path, and the answer is the field that goes with it.
+        """
+        path, field = path[self.oldest :], None
         if self.fresh is None and differ(path, self.poses):
             self.fresh, self.target = self._blank(), path
         if self.fresh is not None:
-            self._continue(self.fresh, path)
+            field = self._continue(self.fresh, path)
         self._forget_oldest()
+        return field
 
-    def resume(self, target: Poses, done: int) -> None:
+    def bend(self, bent: Poses, path: Poses) -> None:
+        """Begin to draw everything along another path than `path`: a loop was closed."""
+        self.correction = composed(bent[-1:], inverted(path[-1:]))
+        self.resume(bent[self.oldest :], 0, is_bent=True)
+
+    def resume(self, target: Poses, done: int, is_bent: bool) -> None:
         """Go on with a drawing of which `done` keyframes were drawn."""
         self.fresh, self.target = self._blank(), target
+        if is_bent:
+            self.fresh.field = TiledFields(1, self.options.resolution_m, FIELD_SIGMA_M)
+            stamp_all(self.fresh.field, self._base_points_m())
         for k in range(done):
             self.fresh._draw(self.scans[k], target[k])
 
     def _blank(self) -> Drawing:
         fresh = Drawing(self.options)
         fresh.grid = self.base.copy()
+        if self.oldest:
+            fresh.coarse.stamp(self._base_points_m())
         return fresh
 
-    def _continue(self, fresh: Drawing, path: Poses) -> None:
-        done = len(fresh.poses)
-        self.target = np.vstack([self.target, path[len(self.target) :]])
-        for k in range(done, min(done + SCANS_A_CALL, len(path))):
+    def _base_points_m(self) -> NDArray[np.float32]:
+        """(N, 2) middles of the occupied cells that no kept scan can draw again."""
+        grid = self.base.trinary()
+        return grid.points_of(np.argwhere(grid.cells == OCCUPIED)).astype(np.float32)
+
+    def _continue(self, fresh: Drawing, path: Poses) -> TiledFields | None:
+        done, added = len(fresh.poses), path[len(self.target) :]
+        if fresh.field is not None:
+            added = composed(np.repeat(self.correction, len(added), axis=0), added)
+        self.target = np.vstack([self.target, added])
+        most = SCANS_A_CALL if fresh.field is None else BENT_SCANS_A_CALL
+        for k in range(done, min(done + most, len(path))):
             fresh._draw(self.scans[k], self.target[k])
-        if len(fresh.poses) == len(path):
-            self.grid.replace_by(fresh.grid)
-            self.coarse, self.poses = fresh.coarse, fresh.poses
-            self.fresh, self.target = None, np.empty((0, 3))
-            self.redrawn += 1
+        if len(fresh.poses) < len(path):
+            return None
+        self.grid.replace_by(fresh.grid)
+        self.coarse, self.poses = fresh.coarse, fresh.poses
+        self.fresh, self.target = None, np.empty((0, 3))
+        self.redrawn += 1
+        return fresh.field
 
     def _forget_oldest(self) -> None:
         """Beyond KEPT_SCANS the older half becomes part of the base."""
@@ -103,6 +139,21 @@ class Drawing:
         del self.scans[:half]
         self.poses = self.poses[half:]
         self.oldest += half
+
+
+def stamp_surface(field: TiledFields, options: MappingOptions, scan: DrawnScan, pose: NDArray[np.float64]) -> None:
+    """What one keyframe adds to the field of a particle."""
+    laser = np.array(laser_position_m(options, SE2.identity()))
+    ranges_m = np.hypot(*(scan.points_m - laser).T).astype(np.float64)
+    x, y, _, _ = placed(pose[None], surface_points(scan.points_m, scan.is_hit, ranges_m))
+    stamp_all(field, np.stack([x[0], y[0]], axis=1))
+
+
+def stamp_all(field: TiledFields, points_m: NDArray[np.float32]) -> None:
+    """Draw (N, 2) map-frame points into the field of the only particle."""
+    if len(points_m):
+        field.cover(points_m.min(axis=0).astype(np.float64), points_m.max(axis=0).astype(np.float64))
+        field.stamp(points_m[None, :, 0], points_m[None, :, 1])
 
 
 def new_grid(options: MappingOptions) -> LogOddsGrid:

@@ -70,8 +70,14 @@ def scan_points(scan: LaserScan, track: OdometryTrack, options: MappingOptions) 
     is_hit = ranges[is_return] < reach_m
     ends = points.astype(np.float32)
     hits = one_per_voxel(ends[is_hit])
-    surface = one_per_voxel(np.vstack([hits, between(ends, is_hit, cut)]))
-    return ScanPoints(stamp_s, ends, is_hit, thinned(with_normals(hits), MOST_SURFELS), surface, scan.is_partial)
+    return ScanPoints(
+        stamp_s, ends, is_hit, thinned(with_normals(hits), MOST_SURFELS), surface_points(ends, is_hit, cut), scan.is_partial
+    )
+
+
+def surface_points(ends_m: NDArray[np.float32], is_hit: NDArray[np.bool_], ranges_m: NDArray[np.float64]) -> NDArray[np.float32]:
+    """(K, 2) hits and the surfaces between neighbouring ones, one a voxel."""
+    return one_per_voxel(np.vstack([one_per_voxel(ends_m[is_hit]), between(ends_m, is_hit, ranges_m)]))
 
 
 def matching_reach_m(returns_m: NDArray[np.float64], options: MappingOptions) -> float:

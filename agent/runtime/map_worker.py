@@ -5,6 +5,8 @@ Nothing but readings and a person's command reaches this thread: a slow network 
 
 from __future__ import annotations
 
+import logging
+import math
 import queue
 import time
 from collections.abc import Callable
@@ -15,6 +17,8 @@ from agent.mapping.mapper import Mapper
 from agent.runtime.latest import Latest
 from agent.runtime.pace import REAL, Pace
 from agent.runtime.sensing import Readings
+
+log = logging.getLogger(__name__)
 
 WAIT_S = 0.25
 WAIT_FOR_ODOMETRY_S = 0.12  # two samples of a 20 Hz encoder board
@@ -54,7 +58,10 @@ class MapWorker:
         if scan is None or self.is_paused:
             return
         started = time.thread_time()
-        self.mapper.add_scan(replace(scan, stamp_s=scan.stamp_s + self._shift_s) if self._shift_s else scan)
+        outcome = self.mapper.add_scan(replace(scan, stamp_s=scan.stamp_s + self._shift_s) if self._shift_s else scan)
+        if outcome.loop is not None:
+            turned_deg = math.degrees(outcome.loop.turned_rad)
+            log.info("loop closed moved_m=%.2f turned_deg=%.1f", outcome.loop.moved_m, turned_deg)
         self.scan_cpu_s += time.thread_time() - started
         self.scans += 1
         now = self._pace.clock()

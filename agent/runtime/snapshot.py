@@ -53,9 +53,11 @@ def snapshot(node: Node) -> dict[str, Any]:
                 "match_factor": round(e.match_factor, 4),
                 "T_a_b": plain_pose(e.T_a_b),
                 "is_used": e not in fleet.rejected_edges,
+                "age_s": node.records.edge_age_s(e.robot_a, e.robot_b),
             }
             for e in fleet.edges
         ],
+        "merge_times": node.records.merge_times(),
         "global": None
         if global_map is None
         else {
@@ -100,6 +102,7 @@ def mapping(node: Node) -> dict[str, Any]:
             "status": str(getattr(estimate.status, "value", estimate.status)),
             "known_m2": round(estimate.grid.known_area_m2(), 2),
             "particles": round(estimate.effective_particles, 1),
+            "loops_closed": estimate.loops_closed,
             "pose": plain_pose(estimate.T_map_robot),
             "pose_stamp_s": estimate.stamp_s,
         }

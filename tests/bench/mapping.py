@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from agent.mapping.log_odds import UNIT, LogOddsGrid
 from agent.mapping.mapper import Mapper
 from agent.mapping.options import MappingOptions
+from agent.runtime.own_loops import fit_in_own_map
 from hw.readings import LaserScan, Odometry
 from protocol.geometry import SE2
 from tests.bench import recordings
@@ -39,7 +40,7 @@ Readings = list[LaserScan | Odometry]
 
 def run(recording: Recording, readings: Readings, seed: int, particles: int) -> dict[str, object]:
     """One log, one seed: a row of the table."""
-    mapper = Mapper(MappingOptions(particles=particles), seed)
+    mapper = Mapper(MappingOptions(particles=particles), seed, fit_in_own_map)
     keyframes = held = 0
     started = time.process_time()
     for reading in readings:
@@ -49,6 +50,7 @@ def run(recording: Recording, readings: Readings, seed: int, particles: int) -> 
             outcome = mapper.add_scan(reading)
             keyframes += outcome.is_keyframe
             held += bool(outcome.reason)
+    mapper.finish()
     cpu_ms = 1e3 * (time.process_time() - started)
     scans = sum(isinstance(r, LaserScan) for r in readings)
     row: dict[str, object] = {"log": recording.name, "seed": seed, **scores(recording, mapper.map.trajectory())}
@@ -58,6 +60,7 @@ def run(recording: Recording, readings: Readings, seed: int, particles: int) -> 
         "of GMapping": round(cpu_ms / keyframes / GMAPPING_MS[recording.name], 3) if recording.name in GMAPPING_MS else None,
         "MB": round(mapper.map.filter.fields.used_bytes() / 1e6, 1),
         "held": held,
+        "loops": mapper.loops_closed,
         "epoch": mapper.epoch,
     }
     return row

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from agent.mapping.estimate import MapperStatus, ScanOutcome
 from agent.mapping.mapper import Mapper
 from agent.mapping.options import MappingOptions
+from agent.runtime.own_loops import fit_in_own_map
 from hw.readings import LaserScan, Odometry
 from hw.sim.raycast import cast
 from hw.sim.robot import SimulatedRobot
@@ -118,7 +119,7 @@ def feed(mapper: Mapper, revolution: Revolution) -> tuple[ScanOutcome, float]:
 
 
 def run(name: str, seed: int, minutes: float, options: MappingOptions) -> dict[str, object]:
-    world, mapper = world_of(name, seed), Mapper(options, seed)
+    world, mapper = world_of(name, seed), Mapper(options, seed, fit_in_own_map)
     errors, cpu_s, held, T_world_map = [], 0.0, 0, None
     for revolution in explore(world, seed, minutes):
         outcome, spent_s = feed(mapper, revolution)
@@ -142,6 +143,7 @@ def run(name: str, seed: int, minutes: float, options: MappingOptions) -> dict[s
         "cpu_of_core": round(cpu_s / (minutes * 60), 4),
         "held": held,
         "keyframes": len(mapper.map.filter.line),
+        "loops": mapper.loops_closed,
         "epoch": mapper.epoch,
     }
 
