@@ -120,7 +120,7 @@ def zenoh_config(settings: NetworkSettings) -> dict[str, Any]:
             "endpoints": list(settings.connect),
             "retry": {
                 "period_init_ms": 100 if loopback else 500,
-                "period_max_ms": 1000 if loopback else 4000,
+                "period_max_ms": 1000 if loopback else 4000 if radio else 1500,  # a healed link has to be found within 5 s
                 "period_increase_factor": 1.7,
             },
         },
