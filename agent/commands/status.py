@@ -61,9 +61,11 @@ def status_text(status: Facts, before: Facts | None = None, *, colour: bool = Fa
     lines += [_line("mapping", _mapping(status["mapping"], colour))]
     lines += [_line(device["name"], _device(device, colour)) for device in status["devices"]]
     lines += [_line("fleet", text) for text in _fleet(status, before)]
-    lines += [_line("peer", _peer(peer, colour)) for peer in status["peers"]]
+    lines += [_line("peer", _peer(peer, _fits_for_s(status, peer["robot"]), colour)) for peer in status["peers"]]
     if status.get("global"):
         lines.append(_line("together", _together(status["global"])))
+    if status.get("merge_times"):
+        lines.append(_line("merging", _merging(status["merge_times"])))
     lines += [_line("", painted("! " + printable(problem), "warn", colour=colour)) for problem in status["problems"]]
     return "\n".join(lines)
 
@@ -108,17 +110,29 @@ def traffic(status: Facts) -> tuple[int, int]:
     return network["sent_bytes"] + network["served_bytes"], network["received_bytes"] + network["pulled_bytes"]
 
 
-def _peer(peer: Facts, colour: bool) -> str:
+def _fits_for_s(status: Facts, peer: str) -> float | None:
+    """Since when the maps of the two fit."""
+    ages = [edge.get("age_s") for edge in status["edges"] if {edge["a"], edge["b"]} == {status["robot"], peer}]
+    return ages[0] if ages else None
+
+
+def _peer(peer: Facts, fits_for_s: float | None, colour: bool) -> str:
     factor = f", match factor {peer['match_factor']:.3f}" if peer.get("match_factor") else ""
     tried = f", {peer['attempts']} attempts" if peer.get("attempts") else ""
     reason = f" ({printable(peer['reason'])})" if peer.get("reason") else ""
-    pair = _state(peer["pair"], colour)
+    pair = _state(peer["pair"], colour) + (f" for {duration(fits_for_s)}" if fits_for_s is not None else "")
     return f"{printable(peer['robot'])} {_state(peer['state'], colour)} {peer['age_s']:.1f} s ago, {pair}{factor}{tried}{reason}"
 
 
 def _together(fused: Facts) -> str:
     members = ", ".join(printable(member) for member in fused["members"])
     return f"{fused['known_m2']:.0f} m2 of {members}; {fused['conflicting_cells']} cells conflict and are unknown"
+
+
+def _merging(took: Facts) -> str:
+    return f"{took['p50_s']:.1f} s from hearing a peer to fitting its map" + (
+        f" in the middle of {took['peers']}, {took['p90_s']:.1f} s for the slowest tenth" if took["peers"] > 1 else ""
+    )
 
 
 def _state(word: str, colour: bool) -> str:

@@ -54,6 +54,11 @@ def families(status: Mapping[str, Any]) -> Iterator[tuple[str, str, str, list[Sa
     yield "peer_match_factor", "gauge", "Equation 3 of the last comparison with a peer.", factors
     attempts: list[Sample] = [({"peer": p["robot"]}, p["attempts"]) for p in peers]
     yield "peer_merge_attempts_total", "counter", "Comparisons with a peer.", attempts
+    took = status.get("merge_times") or {}
+    quantiles: list[Sample] = [({"quantile": q}, took[name]) for q, name in (("0.5", "p50_s"), ("0.9", "p90_s")) if name in took]
+    yield "merge_seconds", "gauge", "From hearing a peer first to the first fit with its map.", quantiles
+    ages: list[Sample] = [({"a": e["a"], "b": e["b"]}, e["age_s"]) for e in status.get("edges", []) if e["age_s"] is not None]
+    yield "edge_age_seconds", "gauge", "Since an edge last began.", ages
     yield "worker_idle_seconds", "gauge", "Since a worker's last step.", [({"worker": w["name"]}, w["idle_s"]) for w in workers]
     yield "worker_errors_total", "counter", "Steps that failed.", [({"worker": w["name"]}, w["errors"]) for w in workers]
 

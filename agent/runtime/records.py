@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from agent.fleet.effects import Note
+from agent.runtime.merge_times import MergeTimes
 
 log = logging.getLogger(__name__)
 
@@ -33,23 +34,36 @@ class Records:
         self._unwritten: deque[str] = deque(maxlen=KEPT)
         self._since_s = time.monotonic()
         self.counts: dict[str, int] = {}
+        self.times = MergeTimes()
         self.last_error = ""  # why the newest lines are not on disk
 
     def add(self, note: Note) -> None:
+        uptime_s = time.monotonic() - self._since_s
         record = {
             "event": note.event,
             "time": time.strftime("%Y-%m-%dT%H:%M:%S%z"),  # a label for people, never compared
-            "uptime_s": round(time.monotonic() - self._since_s, 3),
+            "uptime_s": round(uptime_s, 3),
             **{name: plain(value) for name, value in note.facts.items()},
         }
         with self._lock:
             self._kept.append(record)
+            self.times.add(note.event, note.facts, uptime_s)
             self.counts[note.event] = self.counts.get(note.event, 0) + 1
             self._write(record)
 
     def of(self, event: str, count: int = 20) -> list[dict[str, Any]]:
         with self._lock:
             return [record for record in self._kept if record["event"] == event][-count:]
+
+    def edge_age_s(self, a: str, b: str) -> float | None:
+        """Since the edge between two robots last began."""
+        with self._lock:
+            return self.times.edge_age_s(a, b, time.monotonic() - self._since_s)
+
+    def merge_times(self) -> dict[str, Any] | None:
+        """See `MergeTimes.took`."""
+        with self._lock:
+            return self.times.took()
 
     def newest(self, count: int) -> list[dict[str, Any]]:
         with self._lock:

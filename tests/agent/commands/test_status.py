@@ -24,9 +24,10 @@ def test_a_status_tells_the_robot_in_a_few_lines(run: Run, robot: StartRobot) ->
         "  lidar    running 10.0 Hz, 450 points, LD06, ld06:/dev/ttyUSB0",
         "  fleet    mapquilt: one map with r2; 1 links, lan, shared",
         "  fleet    sent 2.0 KB, received 0.5 KB",
-        "  peer     r2 alive 0.2 s ago, merged, match factor 0.961, 3 attempts",
+        "  peer     r2 alive 0.2 s ago, merged for 2 min 5 s, match factor 0.961, 3 attempts",
         "  peer     r3?[2J lost 45.0 s ago, no, 1 attempts (little common wall)",
         "  together 130 m2 of r1, r2; 12 cells conflict and are unknown",
+        "  merging  4.2 s from hearing a peer to fitting its map",
         "           ! wheels wheels:/dev/ttyACM0: no such port",
     ]
 
