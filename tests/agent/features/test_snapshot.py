@@ -40,6 +40,19 @@ def test_an_updated_snapshot_equals_a_fresh_one(seed: int) -> None:
     assert same_walls(before.updated(changed), MapSnapshot.of(changed))
 
 
+def test_everything_that_follows_from_an_update_is_as_if_made_afresh() -> None:
+    before = MapSnapshot.of(GRID)
+    assert len(before.walls) and len(before.features)
+    changed = with_a_box(GRID, 40, 60)
+    later, fresh = before.updated(changed), MapSnapshot.of(changed)
+    for image in ("fine", "coarse", "nearest", "distance_m"):
+        assert np.array_equal(getattr(later.field, image), getattr(fresh.field, image)), image
+    for table in ("lines", "circles", "arcs", "curves"):
+        assert np.array_equal(getattr(later.features, table), getattr(fresh.features, table)), table
+    assert np.array_equal(later.signatures.values, fresh.signatures.values)
+    assert np.array_equal(later.corners.positions_m, fresh.corners.positions_m)
+
+
 def test_a_map_whose_origin_moved_keeps_its_wall_points() -> None:
     before = MapSnapshot.of(GRID)
     assert len(before.walls)
