@@ -134,6 +134,8 @@ class Roster:
                     return None
             elif not isinstance(message, Beat | Hello | MapAnnouncement):
                 return None  # a new life introduces itself first
+            elif still_beats(peer, now_s):
+                return None  # a twin, perhaps: the life that is known is believed until it misses a beat
             self._reborn(peer, message.boot)
         peer.heard_s = now_s
         return peer
@@ -189,6 +191,11 @@ class Roster:
             return False
         del self.peers[min(lost, key=lambda peer: peer.heard_s).robot]
         return True
+
+
+def still_beats(peer: Peer, now_s: float) -> bool:
+    """Whether the life we know was heard within its period and a half."""
+    return peer.beat is not None and now_s - peer.beat_s < 1.5 * peer.period_s
 
 
 def newer_statements(peer: Peer, said: Statements) -> list[Statement]:

@@ -274,6 +274,7 @@ def test_twins_are_noticed_within_two_beats_and_the_younger_falls_silent() -> No
     twin = fleet.add("twin", explorer, robot="r1")
     assert twin.coordinator is not None
     assert fleet.run_until(lambda: twin.coordinator.is_twin, 10.0) < 4.0  # type: ignore[union-attr]
+    assert not fleet.nodes["r0"].coordinator._ledger.peers["r1"].ghosts  # type: ignore[union-attr]  # the elder was believed
     fleet.run_until(lambda: fleet.agrees(names(2)), 15.0)
     assert not fleet.nodes["r1"].coordinator.is_twin  # type: ignore[union-attr]
     assert twin.coordinator.register("map/feat") is None
