@@ -45,6 +45,10 @@ class PoseGraph:
         if self._fits(GATE).all():
             return self._fits(GATE)
         self._minimise_absolute(sure)
+        return self.settle(sure)
+
+    def settle(self, sure: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Let go of the edges that do not fit, from poses that are about right; (E,) which fit."""
         for gate in GATE * np.array([64.0, 16.0, 4.0, 1.0, 1.0, 1.0]):
             self._minimise(np.where(sure | self._fits(float(gate)), 1.0, WRONG_WEIGHT))
         return self._fits(GATE)

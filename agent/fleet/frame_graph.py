@@ -9,9 +9,12 @@ from __future__ import annotations
 
 import functools
 import math
+import random
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+
+import numpy as np
 
 from agent.fleet.frame_solver import Edge, Problem, covariances
 from protocol.geometry import SE2, wrap_angle
@@ -19,6 +22,7 @@ from protocol.messages import Symmetric3
 
 __all__ = ["Edge", "Group", "Layout", "solve"]
 
+_SMALL_GROUP, _MAX_TREES = 16, 40
 _LOOP_M, _LOOP_RAD = 0.6, math.radians(4.0)  # a two-hop detour that ends within this agrees
 
 
@@ -94,13 +98,19 @@ def _components(edges: tuple[Edge, ...]) -> list[list[Edge]]:
 def _fit(edges: list[Edge]) -> tuple[list[Edge], dict[str, SE2], dict[str, Symmetric3]]:
     """Lay out one component: the edges that fit, the frames, their covariance."""
     names = sorted({edge.a for edge in edges} | {edge.b for edge in edges})
-    frames = _tree_layout(names, edges, _consensus(edges))
+    votes = _consensus(edges)
+    frames = _tree_layout(names, sorted(edges, key=lambda edge: (votes[edge.id], edge.trust, edge.id), reverse=True))
     if len(edges) == len(names) - 1:  # no loop: nothing to weigh
         return edges, frames, covariances(names, edges, frames)
     problem = Problem(names, edges, frames)
-    kept = [edge for edge, fits in zip(edges, problem.fit(), strict=True) if fits]
-    if len(kept) < len(edges):
-        return kept, {}, {}
+    fits = problem.fit()
+    if not fits.all() and len(names) <= _SMALL_GROUP:
+        other = max(_layouts(names, edges, votes), key=Problem.roughly_fitting)
+        others_fits = other.settle(np.zeros(len(edges), bool))
+        if others_fits.sum() > fits.sum() + 1:  # one more may be a wrong one that nothing contradicts
+            problem, fits = other, others_fits
+    if not fits.all():
+        return [edge for edge, fit in zip(edges, fits, strict=True) if fit], {}, {}
     fitted = problem.frames()
     return edges, fitted, covariances(names, edges, fitted)
 
@@ -121,9 +131,18 @@ def _consensus(edges: list[Edge]) -> dict[bytes, tuple[int, int]]:
     return votes
 
 
-def _tree_layout(names: list[str], edges: list[Edge], votes: Mapping[bytes, tuple[int, int]]) -> dict[str, SE2]:
-    """Frames along the most trusted spanning tree, from the smallest name at identity."""
+def _layouts(names: list[str], edges: list[Edge], votes: Mapping[bytes, tuple[int, int]]) -> Iterator[Problem]:
+    """Layouts along different spanning trees, the most trusted first: in a small group one wrong branch spoils all."""
     ranked = sorted(edges, key=lambda edge: (votes[edge.id], edge.trust, edge.id), reverse=True)
+    yield Problem(names, edges, _tree_layout(names, ranked))
+    rng = random.Random(len(edges))
+    for _ in range(_MAX_TREES):
+        drawn = {edge.id: rng.random() ** ((1.0 - votes[edge.id][0]) / (1.0 + votes[edge.id][1])) for edge in ranked}
+        yield Problem(names, edges, _tree_layout(names, sorted(edges, key=lambda edge: (drawn[edge.id], edge.id), reverse=True)))
+
+
+def _tree_layout(names: list[str], ranked: list[Edge]) -> dict[str, SE2]:
+    """Frames along the spanning tree of the first edges, from the smallest name at identity."""
     joined = {name: name for name in names}
 
     def find(name: str) -> str:

@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 
 from protocol.geometry import SE2, wrap_angle
 from protocol.messages import Symmetric3
-from protocol.pose_graph import DENSE_NODES, PoseGraph, dense_hessian
+from protocol.pose_graph import DENSE_NODES, GATE, PoseGraph, dense_hessian
 
 _SIGMA_M, _SIGMA_RAD = 0.05, math.radians(0.5)  # floor: maps bend by about this between robots
+
+_ROUGH = 16.0  # four times as far off as an edge that fits
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +43,10 @@ class Problem(PoseGraph):
             np.array([_information(edge.covariance) for edge in edges]),
             np.array([[frames[name].x_m, frames[name].y_m, frames[name].theta_rad] for name in names]),
         )
+
+    def roughly_fitting(self) -> int:
+        """How many edges the frames bear out as they are, before anything is averaged."""
+        return int(np.count_nonzero(self.squared_residuals() <= _ROUGH * GATE))
 
     def frames(self) -> dict[str, SE2]:
         return {name: SE2(float(x), float(y), wrap_angle(float(t))) for name, (x, y, t) in zip(self.names, self.x, strict=True)}
