@@ -22,6 +22,7 @@ from hw.readings import LaserScan
 from hw.scan_assembler import supported_only
 
 STX, ACK, NAK = 0x02, 0x06, 0x15
+ACKS = (bytes((ACK,)), bytes((NAK,)))
 HOST_ADDRESS, SCANNER_ADDRESS = 0x00, 0x80
 MOST_PAYLOAD = 812
 STATUS, TYPE, RESET, MODE, VARIANT = b"\x31", b"\x3a", b"\x10", 0x20, 0x3B
@@ -38,6 +39,7 @@ FIELDS = {
 MIRROR_S = 1 / 75  # a turn of the mirror; half- and quarter-degree scans take two and four
 RANGE_MIN_M, RANGE_MAX_M = 0.05, 80.0
 CM_CODES, MM_CODES = 0x1FF7, 0x7FF7  # from here on a value is no distance: dazzled, out of range, ...
+HEAD_BYTES = 4
 SUSPECT_SCANS = 8  # after damage on the line so many scans are looked at twice: a 16-bit sum misses one bad telegram in 65536
 
 
@@ -122,12 +124,12 @@ class SickLms(DriverBase):
         self._rate, self._step_deg = rate, step_deg
         self._window = ByteWindow(self.counters)
         self._finder = SizedFrames(
-            bytes((STX, SCANNER_ADDRESS)), 4, 6 + MOST_PAYLOAD, _size, lambda f: crc16(f[:-2]) == (f[-2] | f[-1] << 8)
+            bytes((STX, SCANNER_ADDRESS)), HEAD_BYTES, 6 + MOST_PAYLOAD, _size, lambda f: crc16(f[:-2]) == (f[-2] | f[-1] << 8)
         )
         self._answers: dict[int, bytes] = {}
         self._last_scan_s: float | None = None
         self._suspect_scans = 0
-        self._is_ack_due = False
+        self._held: LaserScan | None = None  # on a line that is not clean, until the next telegram begins
 
     def limit(self, range_min_m: float, range_max_m: float) -> None:
         """Believe only ranges within these limits."""
@@ -137,7 +139,7 @@ class SickLms(DriverBase):
         """See `Driver.restart`."""
         self._window.clear()
         self._answers.clear()
-        self._last_scan_s = None
+        self._last_scan_s, self._held = None, None
 
     def start(self) -> Script:
         """Stop sending, are you there, the rate, the resolution, send."""
@@ -163,18 +165,17 @@ class SickLms(DriverBase):
 
     def _ask(self, payload: bytes, answer: int, timeout_s: float) -> Ask:
         self._answers.pop(answer, None)
-        self._is_ack_due = True
         return Ask(encode(payload), lambda: self._answers.get(answer), timeout_s)
 
     def feed(self, data: bytes, now_s: float) -> list[Reading]:
         """Scans that these bytes complete; answers are kept for the script."""
         self._window.push(data)
-        if self._is_ack_due and self._window.data[:1] in (bytes((ACK,)), bytes((NAK,))):
-            self._window.take(1)  # stands before each answer, outside of its telegram
-            self._is_ack_due = False
+        if self._window.data[:1] in ACKS and self._window.data[1:2] in (b"", bytes((STX,))):
+            self._window.take(1)  # stands before each answer, outside of its telegram: no damage
         frames = self._finder.take(self._window, self.counters)
         readings: list[Reading] = []
         for row, behind, gap in zip(frames.data, frames.behind.tolist(), frames.gap.tolist(), strict=True):
+            readings += self._released(is_followed=gap == 0)
             self._suspect_scans = SUSPECT_SCANS if gap else max(0, self._suspect_scans - 1)
             n = int(row[2]) | int(row[3]) << 8
             payload = row[4 : 4 + n].tobytes()
@@ -182,8 +183,20 @@ class SickLms(DriverBase):
             if scan is None:
                 self._answers[payload[0]] = payload
             else:
-                readings.append(self._scan(scan, now_s - (behind + 6 + n) * 10.0 / self.baud))
+                self._held = self._scan(scan, now_s - (behind + 6 + n) * 10.0 / self.baud)
+        if not self._suspect_scans or self.counters.gap_bytes or len(self._window) >= HEAD_BYTES:
+            readings += self._released(is_followed=not self.counters.gap_bytes)
         return readings
+
+    def _released(self, is_followed: bool) -> list[Reading]:
+        """The scan that waits, when the next telegram begins right behind it: one that lost bytes has eaten of the next."""
+        scan, self._held = self._held, None
+        if scan is None:
+            return []
+        if self._suspect_scans and not is_followed:
+            self.counters.rejected += 1
+            return []
+        return [scan]
 
     def _scan(self, scan: ScanPayload, end_s: float) -> LaserScan:
         """The last beam was measured before the telegram began."""

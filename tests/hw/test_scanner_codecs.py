@@ -147,3 +147,11 @@ def test_lds01_packets(index: int, mm: list[int], signals: list[int]) -> None:
 def test_ldrobot_packets(speed: int, start: int, clock_ms: int, mm: list[int]) -> None:
     packet = ld06.Packet(speed, start, (start + 880) % 36000, clock_ms, tuple(mm), tuple(range(12)))
     assert ld06.decode(ld06.encode(packet)) == packet
+
+
+def test_on_a_bad_line_a_sick_scan_waits_until_the_next_one_begins_right_behind_it() -> None:
+    driver, telegram = SickLms(), sick_lms.scan_telegram([800] * 181)
+    assert len(driver.feed(telegram, 1.0)) == 1, "on a clean line at once"
+    assert driver.feed(b"\0\0\0" + telegram, 2.0) == []
+    assert len(driver.feed(telegram[:4], 3.0)) == 1
+    assert driver.feed(telegram[4:] + b"\0\0\0", 4.0) == [], "what follows is no telegram: it may have eaten of one"
