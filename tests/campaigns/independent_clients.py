@@ -125,8 +125,14 @@ def main() -> int:
     parser.add_argument("--only", default="", help="client or device")
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
-    rows = [judged(args.python, *case) for case in CASES if args.only in ("", *case)]
-    print(json.dumps([asdict(row) for row in rows], indent=2) if args.json else table(rows))
+    rows = []
+    for case in CASES:
+        if args.only in ("", *case):
+            rows.append(judged(args.python, *case))
+            if not args.json:
+                print(("" if len(rows) > 1 else HEAD) + line(rows[-1]), flush=True)
+    if args.json:
+        print(json.dumps([asdict(row) for row in rows], indent=2))
     return int(any(row.verdict.startswith("WRONG") for row in rows))
 
 
@@ -190,11 +196,11 @@ def serving(folder: Path, device: str, options: list[str]) -> Iterator[None]:
     command = [sys.executable, "-m", "agent", "-q", "sim", device, "--link", str(folder / "port"), "--noise", "0", *options]
     program = subprocess.Popen(command, cwd=folder, env={**os.environ, "PYTHONPATH": str(FOREIGN.parents[2])})
     try:
-        until((folder / "port").exists, 20.0, "the port")
+        until(lambda: (folder / "port").exists() or program.poll() is not None, 60.0, "the port")
         yield
     finally:
         program.send_signal(signal.SIGTERM)
-        program.wait(10)
+        program.wait(20)
 
 
 def by_mrpt(folder: Path, device: str, driver: str) -> Rows:
@@ -263,16 +269,16 @@ def way_errors_m(device: str, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
     return best(went_m), best(went_m[:, ::-1])
 
 
-def table(rows: list[Row]) -> str:
-    """Markdown."""
-    lines = [
-        "| client | device | mode | readings | median | 95 % | mirrored, or the other wheel | verdict |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    for row in rows:
-        figures = [f"{1e3 * value:.1f} mm" for value in (row.median_m, row.p95_m, row.control_median_m)]
-        lines.append(f"| {row.client} | {row.device} | {row.mode} | {row.readings} | {' | '.join(figures)} | {row.verdict} |")
-    return "\n".join(lines)
+HEAD = """\
+| client | device | mode | readings | median | 95 % | mirrored, or the other wheel | verdict |
+| --- | --- | --- | --- | --- | --- | --- | --- |
+"""
+
+
+def line(row: Row) -> str:
+    """Of a Markdown table."""
+    figures = [f"{1e3 * value:.1f} mm" for value in (row.median_m, row.p95_m, row.control_median_m)]
+    return f"| {row.client} | {row.device} | {row.mode} | {row.readings} | {' | '.join(figures)} | {row.verdict} |"
 
 
 if __name__ == "__main__":
