@@ -28,6 +28,7 @@ from agent.merging.matched_features import matched_features
 from agent.merging.matching import match_maps
 from agent.merging.resampling import resampled_like
 from agent.merging.result import MatchOptions, MatchStatus, MergeResult
+from agent.view.group_picture import Member, group_picture
 from agent.view.merge_picture import MapToDraw, Overlay, merge_picture
 from agent.view.render import png
 from protocol.geometry import SE2
@@ -171,18 +172,42 @@ def write_merged(merged: Merged, output: Path, resolution_m: float | None) -> li
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, png(pair_picture(merged, (i, j))))
         written.append(path)
+    if merged.fused is not None and len(merged.maps) > 2:
+        path = base.with_name(f"{base.name}.png")
+        write_atomically(path, png(all_together(merged, merged.fused)))
+        written.append(path)
     return written
 
 
 def _fused_in_first_frame(merged: Merged, resolution_m: float | None) -> FusedMap:
     """On the first map's own lattice, so that its cells stay as they are; a map whose frame is turned is drawn upright."""
     first = merged.maps[0].grid.origin
-    T_lattice_corner = SE2.identity() if first.theta_rad == 0 else first
+    T_lattice_corner = _lattice(merged)
     laid = [(at_corner(merged.maps[i].grid), T_lattice_corner @ T) for i, T in sorted(merged.T_first.items())]
     fused = fuse(laid, resolution_m)
     if first.theta_rad != 0:
         return fused
     return replace(fused, grid=replace(fused.grid, origin=first @ fused.grid.origin))
+
+
+def all_together(merged: Merged, fused: FusedMap) -> NDArray[np.uint8]:
+    """Every map by itself, and those that joined on one sheet."""
+    first, T_lattice_corner = merged.maps[0].grid.origin, _lattice(merged)
+    T_lattice_file = T_lattice_corner @ first.inverse()
+    on_lattice = replace(fused.grid, origin=T_lattice_file @ fused.grid.origin)
+    members = []
+    for i, loaded in enumerate(merged.maps):
+        corner, T = at_corner(loaded.grid), merged.T_first.get(i)
+        laid = None if T is None else resampled_like(on_lattice, corner, T_lattice_corner @ T)
+        members.append(Member(Path(loaded.name).name, corner, laid))
+    figures = [f"{fused.grid.known_area_m2():.0f} m2 known", f"{fused.conflicting_cells} cells conflict"]
+    return group_picture(members, fused.grid, fused.conflicts, figures)
+
+
+def _lattice(merged: Merged) -> SE2:
+    """Where the first map's corner lies on the merged lattice: on its own cells, or upright when its frame is turned."""
+    first = merged.maps[0].grid.origin
+    return SE2.identity() if first.theta_rad == 0 else first
 
 
 def pair_picture(merged: Merged, pair: Pair) -> NDArray[np.uint8]:

@@ -66,7 +66,7 @@ def merge_picture(ours: MapToDraw, theirs: MapToDraw, overlay: Overlay | None, v
     """The whole sheet; without a transform (`overlay` None) only the two maps."""
     half = (WIDTH - 3 * GAP) // 2
     before = _side_by_side(_map_panel(ours, OURS, half), _map_panel(theirs, THEIRS, half))
-    parts = [_heading(verdict, figures), before]
+    parts = [heading(verdict, figures), before]
     if overlay is not None:
         parts += [_legend(), _overlay_panel(overlay, ours, theirs)]
     gap = np.full((GAP, WIDTH, 3), PAPER, np.uint8)
@@ -74,7 +74,7 @@ def merge_picture(ours: MapToDraw, theirs: MapToDraw, overlay: Overlay | None, v
 
 
 def _map_panel(drawn: MapToDraw, colour: Colour, width: int) -> Image:
-    canvas = _Canvas.fitting(drawn.grid, width, max_height=620)
+    canvas = Canvas.fitting(drawn.grid, width, max_height=620)
     canvas.paint(_shaded(drawn.grid))
     for index, row in enumerate(drawn.features.lines):
         if index not in drawn.matched["lines"]:
@@ -91,17 +91,18 @@ def _counted(n: int, plural: str) -> str:
 
 
 def _overlay_panel(overlay: Overlay, ours: MapToDraw, theirs: MapToDraw) -> Image:
-    canvas = _Canvas.fitting(overlay.frame, WIDTH - 2 * GAP, max_height=1100)
+    canvas = Canvas.fitting(overlay.frame, WIDTH - 2 * GAP, max_height=1100)
     canvas.paint(_blended(overlay))
     for number, index in enumerate(ours.matched["lines"], start=1):
         label = str(number) if number <= NUMBERED_LINES else ""
         canvas.wall_line(_moved_line(ours.features.lines[index], overlay.T_frame_ours), AGREE, label, hairs=False)
     canvas.frame_axes(overlay.T_frame_ours, OURS)
     canvas.frame_axes(overlay.T_frame_theirs, THEIRS)
-    return _centred(canvas.image, WIDTH)
+    return centred(canvas.image, WIDTH)
 
 
-def _centred(image: Image, width: int, above: int = 0) -> Image:
+def centred(image: Image, width: int, above: int = 0) -> Image:
+    """In the middle of a strip of paper."""
     side = (width - image.shape[1]) // 2
     right = width - image.shape[1] - side
     padded: Image = cv2.copyMakeBorder(image, above, 0, side, right, cv2.BORDER_CONSTANT, value=PAPER)
@@ -144,7 +145,7 @@ def _widened(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 @dataclass(slots=True, eq=False)
-class _Canvas:
+class Canvas:
     """A picture of a grid's rectangle, `scale` pixels a cell."""
 
     image: Image
@@ -152,10 +153,10 @@ class _Canvas:
     scale: float
 
     @staticmethod
-    def fitting(grid: OccupancyGrid, width: int, max_height: int) -> _Canvas:
+    def fitting(grid: OccupancyGrid, width: int, max_height: int) -> Canvas:
         scale = min(width / grid.width, max_height / grid.height)
         shape = (max(1, round(grid.height * scale)), max(1, round(grid.width * scale)), 3)
-        return _Canvas(np.full(shape, UNKNOWN, np.uint8), grid, scale)
+        return Canvas(np.full(shape, UNKNOWN, np.uint8), grid, scale)
 
     def paint(self, colours: Image) -> None:
         size = (self.image.shape[1], self.image.shape[0])
@@ -250,15 +251,16 @@ def _side_by_side(left: Image, right: Image) -> Image:
 def _titled(image: Image, name: str, counts: str, colour: Colour, width: int) -> Image:
     strip = np.full((44, width, 3), PAPER, np.uint8)
     cv2.rectangle(strip, (0, 8), (16, 24), colour, -1)
-    _write(strip, name, 26, 22, 0.62, INK)
-    _write(strip, counts, 26, 40, 0.42, FAINT)
-    return np.vstack([strip, _centred(image, width, above=6)])
+    write(strip, name, 26, 22, 0.62, INK)
+    write(strip, counts, 26, 40, 0.42, FAINT)
+    return np.vstack([strip, centred(image, width, above=6)])
 
 
-def _heading(verdict: str, figures: Sequence[str]) -> Image:
+def heading(verdict: str, figures: Sequence[str]) -> Image:
+    """The sentence on top, and the numbers below it."""
     strip = np.full((62, WIDTH, 3), PAPER, np.uint8)
-    _write(strip, verdict, GAP, 26, 0.9, INK)
-    _write(strip, "   ".join(figures), GAP, 54, 0.5, INK)
+    write(strip, verdict, GAP, 26, 0.9, INK)
+    write(strip, "   ".join(figures), GAP, 54, 0.5, INK)
     return strip
 
 
@@ -275,10 +277,11 @@ def _legend() -> Image:
         cv2.rectangle(strip, (x, 5), (x + 17, 21), wall, -1)
         cv2.rectangle(strip, (x + 18, 5), (x + 35, 21), free, -1)
         cv2.rectangle(strip, (x, 5), (x + 35, 21), FAINT, 1)
-        _write(strip, text, x + 44, 18, 0.48, INK)
+        write(strip, text, x + 44, 18, 0.48, INK)
         x += 44 + cv2.getTextSize(text, _FONT, 0.48, 1)[0][0] + 30
     return strip
 
 
-def _write(image: Image, text: str, x: int, y: int, size: float, colour: Colour) -> None:
+def write(image: Image, text: str, x: int, y: int, size: float, colour: Colour) -> None:
+    """A line of text that begins at x on the line y."""
     cv2.putText(image, text, (x, y), _FONT, size, colour, 1, cv2.LINE_AA)

@@ -12,6 +12,7 @@ import pytest
 
 from agent import cli
 from agent.map_files import load_map, save_map
+from agent.view.group_picture import SEVERAL
 from protocol.geometry import SE2, wrap_angle
 from protocol.grid import FREE, OCCUPIED, OccupancyGrid
 from tests.harness.floorplans import office
@@ -107,6 +108,8 @@ def test_three_maps_of_two_resolutions_close_their_loop(maps, tmp_path, capsys):
     a, c = load_map(maps["a"]), load_map(maps["c"])
     assert_close(as_se2(answer["maps"][2]), a.origin.inverse() @ T_A @ T_C.inverse() @ c.origin, within_m=0.15)
     assert load_map(tmp_path / "all.yaml").known_area_m2() == pytest.approx(PLAN.width_m * PLAN.height_m, rel=0.05)
+    together = cv2.imread(str(tmp_path / "all.png"))
+    assert int((together == SEVERAL).all(axis=2).sum()) > 10_000  # walls that lie on one another
 
 
 def test_a_stranger_among_three_makes_the_answer_no_and_is_named(maps, capsys):
