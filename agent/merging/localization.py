@@ -22,6 +22,7 @@ LOCAL_RIVAL_SHARE = 0.8
 LOCAL_OBSERVABILITY_M = 1.5
 LOCAL_OBSERVABLE_SHARE = 0.05
 LOCAL_UNSUSPICIOUS = 0.2
+LOCAL_DISTINCTIVE_M = 0.0  # a local map lies in the given one nearly whole: there is no other end to take it for
 
 
 def localize(local: MapSnapshot, given: MapSnapshot, options: MatchOptions | None = None) -> MergeResult:
@@ -45,4 +46,5 @@ def for_local_maps(options: MatchOptions) -> MatchOptions:
         min_observability_m=min(options.min_observability_m, LOCAL_OBSERVABILITY_M),
         min_observable_share=min(options.min_observable_share, LOCAL_OBSERVABLE_SHARE),
         unsuspicious=min(options.unsuspicious, LOCAL_UNSUSPICIOUS),
+        distinctive_m=min(options.distinctive_m, LOCAL_DISTINCTIVE_M),
     )

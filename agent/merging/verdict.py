@@ -23,6 +23,7 @@ USUAL_FACTOR = 0.95  # of true transforms at 10 cm
 FACTOR_SLOPE = 0.3  # coarser cells disagree more at the truth, by this a metre of cell
 MAX_SUSPICION = 1.4  # true pairs of bent maps reach 1.6
 MARGIN_PER_SUSPICION_M = 5.0
+MARGIN_PER_BARE_SUSPICION_M = 12.0  # where little else than long walls agrees: ends of a plan merged wrongly up to 11 a unit
 MIN_DISTINCT_M = 4.0  # two ends of a building share long walls; what tells them apart is short,
 CLEAR_MARGIN_M = 25.0  # unless nothing else comes near: ends that were merged wrongly were ahead by 7 to 13 m
 
@@ -69,13 +70,23 @@ def verdict(grounds: Grounds, options: MatchOptions) -> tuple[MatchStatus, str]:
         return MatchStatus.NO, Reason.LOW_MATCH_FACTOR
     if g.observability_m <= max(options.min_observability_m, options.min_observable_share * g.agreeing_m):
         return MatchStatus.AMBIGUOUS, Reason.UNOBSERVABLE
-    needed_m = options.min_margin_m + MARGIN_PER_SUSPICION_M * max(0.0, g.suspicion - options.unsuspicious)
-    if g.score - g.rival <= needed_m or g.rival >= options.max_rival_share * g.score:
+    if g.score - g.rival <= _needed_margin_m(g, options) or g.rival >= options.max_rival_share * g.score:
         return MatchStatus.AMBIGUOUS, Reason.RIVAL
     is_bare = g.distinct_m < MIN_DISTINCT_M and g.score - g.rival < CLEAR_MARGIN_M
     if g.suspicion > MAX_SUSPICION or is_bare:
         return MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE
     return MatchStatus.MERGED, Reason.MATCHED
+
+
+def _needed_margin_m(g: Grounds, options: MatchOptions) -> float:
+    """More the more it looks like another place of the same kind.
+
+    Two ends of one building share long walls by design, and a few metres of cross wall by accident.  Where short walls and
+    clutter do not outweigh that accident, every doubt counts in full.
+    """
+    if g.distinct_m >= options.distinctive_m:
+        return options.min_margin_m + MARGIN_PER_SUSPICION_M * max(0.0, g.suspicion - options.unsuspicious)
+    return options.min_margin_m + MARGIN_PER_BARE_SUSPICION_M * max(0.0, g.suspicion)
 
 
 def rival_score(poses: Poses, scores: NDArray[np.float64], best: int, around_m: NDArray[np.float64]) -> float:

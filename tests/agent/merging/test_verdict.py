@@ -32,6 +32,12 @@ def test_long_walls_alone_merge_when_no_rival_comes_near() -> None:
     assert verdict(replace(GOOD, distinct_m=3.5), MatchOptions()) == (MatchStatus.MERGED, Reason.MATCHED)
 
 
+def test_little_but_long_walls_must_be_less_suspicious() -> None:
+    doubtful = replace(GOOD, score=18.0, factor=0.91, agreeing_m=20.0, against_m=2.0)
+    assert verdict(doubtful, MatchOptions()) == (MatchStatus.MERGED, Reason.MATCHED)
+    assert verdict(replace(doubtful, distinct_m=9.0), MatchOptions()) == (MatchStatus.AMBIGUOUS, Reason.RIVAL)
+
+
 @pytest.mark.parametrize(
     ("change", "status", "reason"),
     [
