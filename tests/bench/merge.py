@@ -2,7 +2,8 @@
 
 BENCH_DATA=/root/bench/data-2024 .venv/bin/python -m tests.bench.merge                       ours, all sets
 BENCH_DATA='/root/bench/data-{seed}' .venv/bin/python -m tests.bench.merge --seeds 2024 11 12
-.venv/bin/python -m tests.bench.merge --adapters mapquilt paper fmt arw fft seed seed-guarded --stride 4
+.venv/bin/python -m tests.bench.merge --beside --stride 4                              the paper's and the kit's methods too
+.venv/bin/python -m tests.bench.merge --adapters mapquilt paper-guarded fft             some of them
 .venv/bin/python -m tests.bench.merge --json out.json
 
 The kit is ../shared/bench (or MAPQUILT_SHARED); its README says what is in the sets and how success is judged.
@@ -44,7 +45,7 @@ def main() -> None:
 
     runs = []
     print(HEAD + "\n" + "|---" * 11 + "|", flush=True)
-    for adapter in args.adapters:
+    for adapter in [*OURS, *KIT] if args.beside else args.adapters:
         for seed in args.seeds:
             for which in args.sets:
                 folder = Path(args.data.format(seed=seed)) / which
@@ -63,6 +64,7 @@ def _arguments() -> argparse.Namespace:
     default = os.environ.get("BENCH_DATA", str(Path.home() / ".cache/mapquilt-bench/data"))
     parser = argparse.ArgumentParser(prog="tests.bench.merge", description=__doc__.splitlines()[0])  # type: ignore[union-attr]
     parser.add_argument("--adapters", nargs="+", default=["mapquilt"], choices=[*OURS, *KIT])
+    parser.add_argument("--beside", action="store_true", help="every method there is, ours and the kit's")
     parser.add_argument("--seeds", nargs="+", default=["2024"], help="fills {seed} in --data")
     parser.add_argument("--data", default=default, help="where the sets lie (default: BENCH_DATA)")
     parser.add_argument("--sets", nargs="+", default=list(SETS))
