@@ -13,7 +13,7 @@ from agent.mapping.mapper import CONFIRMED_AFTER, NEW_MAP_AFTER_S, Mapper
 from agent.mapping.options import MappingOptions
 from hw.readings import LaserScan, Odometry
 from protocol.geometry import SE2
-from protocol.grid import OCCUPIED
+from protocol.grid import FREE, OCCUPIED, UNKNOWN
 from tests.agent.mapping.worlds import CORRIDOR, ROOMS, DriftingOdometry, rounds, scan_at
 
 OPTIONS = MappingOptions(particles=8)
@@ -237,3 +237,38 @@ def test_a_person_who_walked_by_fades(drive: Drive) -> None:
     grid = drive.mapper.estimate().grid
     spot = (drive.path[0][1].inverse()).apply(np.array([[-0.6, -0.2], [-0.6, -0.1], [-0.6, 0.0]]))
     assert not (grid.values_at(spot) == OCCUPIED).any()
+
+
+def scans_past(drive: Drive, walls: np.ndarray, is_seen: float, n: int) -> None:
+    """Steps in a house where only this share of the beams that meet some walls comes back from there.
+
+    Of the others, those through the pane come back from what stands behind it; nothing comes back from a black one.
+    """
+    bare = np.array([wall for wall in ROOMS if not (walls == wall).all(axis=1).any()])
+    for _ in range(n):
+        pose, stamp_s = drive.path[drive.at][1], drive.now_s
+        whole = scan_at(ROOMS, pose, stamp_s, drive.rng)
+        through = scan_at(bare, pose, stamp_s, drive.rng)
+        is_lost = (through.ranges_m > whole.ranges_m + 0.1) & (drive.rng.random(len(whole.ranges_m)) >= is_seen)
+        drive.mapper.add_odometry(drive.odometry())
+        drive.after = drive.mapper.add_scan(replace(whole, ranges_m=np.where(is_lost, through.ranges_m, whole.ranges_m)))
+        drive.at += 1
+
+
+def test_black_walls_are_left_unknown_and_the_robot_keeps_its_place(drive: Drive) -> None:
+    """The whole north of both rooms sends nothing back: no beam says that there is free space, either."""
+    scans_past(drive, ROOMS[2:3], is_seen=0.0, n=70)
+    assert drive.error_m() < 0.08
+    assert drive.mapper.epoch == 0
+    beyond = np.array([[x, y] for x in (-3.0, 0.0, 2.0) for y in (4.2, 4.5, 5.0)])
+    cells = drive.mapper.estimate().grid.values_at(drive.path[0][1].inverse().apply(beyond))
+    assert (cells == UNKNOWN).all()
+
+
+def test_a_glass_wall_that_half_the_beams_pass_costs_no_more_than_itself(drive: Drive) -> None:
+    """The wall between the two rooms is glass: seen, or the other room behind it, at random."""
+    scans_past(drive, ROOMS[4:6], is_seen=0.5, n=70)
+    assert drive.error_m() < 0.08
+    assert drive.mapper.epoch == 0
+    corner = drive.path[0][1].inverse().apply(np.array([[-2.0, -3.0], [0.0, 4.0]]))
+    assert (drive.mapper.estimate().grid.values_at(corner) != FREE).all()
