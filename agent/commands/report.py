@@ -68,7 +68,7 @@ def report_of(folder: Path, robot: str, config: Any) -> RobotReport:
         ("found a fit with", ", ".join(sorted(merged)) or "nobody"),
     ]
     if records:
-        figures.insert(0, ("from / to", f"{records[0].get('time', '?')} / {records[-1].get('time', '?')}"))
+        figures.insert(0, ("time", span(str(records[0].get("time", "?")), str(records[-1].get("time", "?")))))
     pictures = []
     saved = StateDirectory(folder).load("mapper")
     if saved is not None:
@@ -77,10 +77,17 @@ def report_of(folder: Path, robot: str, config: Any) -> RobotReport:
         except Exception as error:  # of another version or with other settings: the records are still worth a page
             figures.append(("map", f"saved, but it does not fit this program and these settings: {error}"))
         else:
-            figures.append(("known", f"{estimate.grid.known_area_m2():.1f} m2"))
+            figures.append(("known", f"{estimate.grid.known_area_m2():.1f} m²"))
             poses: dict[str, SE2] = {robot: estimate.T_map_robot}
             pictures.append((f"{robot}'s own map, and where it stood last", png(map_picture(estimate.grid.cropped(4), poses))))
     return RobotReport(robot, records, figures, pictures)
+
+
+def span(first: str, last: str) -> str:
+    """Two ISO times as a person writes them: the day once when it is the same."""
+    first, last = (time.replace("T", " ").removesuffix("+0000") for time in (first, last))
+    day, _, clock = last.partition(" ")
+    return f"{first} to {clock if clock and first.startswith(day) else last}"
 
 
 def read_records(path: Path) -> Iterator[dict[str, Any]]:

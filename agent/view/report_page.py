@@ -74,17 +74,19 @@ def _robot(report: RobotReport) -> Iterator[str]:
         source = base64.b64encode(png).decode()
         image = f"<img alt='{_text(caption)}' src='data:image/png;base64,{source}'>"
         yield f"<figure>{image}<figcaption>{_text(caption)}</figcaption></figure>\n"
-    yield _peers(attempts)
+    yield _peers(attempts, any(record.get("event") == "peer-joined" for record in report.records))
     yield _chart(attempts)
     yield _attempts(attempts)
     yield _events([record for record in report.records if record.get("event") != "merge-attempt"])
     yield "</section>\n"
 
 
-def _peers(attempts: Sequence[Record]) -> str:
+def _peers(attempts: Sequence[Record], has_met: bool) -> str:
     """Who merged and who did not, and why: one line a peer."""
+    if not attempts and has_met:
+        return "<p>It tried no merge itself: of two robots the one whose name comes first tries, and its page says why.</p>\n"
     if not attempts:
-        return "<p>No merge was tried: no other robot's map was seen.</p>\n"
+        return "<p>No merge was tried: no other robot was heard.</p>\n"
     rows = []
     for peer in sorted({str(record.get("peer")) for record in attempts}):
         mine = [record for record in attempts if str(record.get("peer")) == peer]
@@ -146,11 +148,23 @@ def _attempts(attempts: Sequence[Record]) -> str:
                 f"{_number(record.get('match_factor')):.3f}",
                 f"{_number(record.get('overlap_m2')):.1f}",
                 f"{_number(record.get('score')):.1f} / {_number(record.get('runner_up')):.1f}",
+                _text(record.get("candidates", "")),
                 place,
                 _text(record.get("reason", "")),
             )
         )
-    heads = ("s", "peer", "purpose", "answer", "match factor", "overlap m²", "score / runner-up", "x m, y m, yaw rad", "reason")
+    heads = (
+        "s",
+        "peer",
+        "purpose",
+        "answer",
+        "match factor",
+        "overlap m²",
+        "score / runner-up",
+        "tried",
+        "x m, y m, yaw rad",
+        "reason",
+    )
     which = "every attempt" if len(attempts) == len(rows) else f"the last {len(rows)} of {len(attempts)} attempts"
     return f"<details><summary>The numbers of {which}</summary>{_table(heads, rows)}</details>\n"
 

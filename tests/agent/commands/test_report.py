@@ -6,6 +6,7 @@ import json
 from html.parser import HTMLParser
 from pathlib import Path
 
+from agent.commands.report import span
 from agent.merging.result import Reason
 from agent.runtime.state import StateDirectory
 from agent.view.report_page import REASONS, RobotReport, report_page
@@ -114,3 +115,11 @@ def test_a_long_run_stays_a_readable_page() -> None:
     html = report_page([RobotReport("r1", records)], "long")
     assert "the last 500 of 3000 attempts" in html
     assert len(html) < 1_500_000
+
+
+def test_a_robot_that_left_trying_to_the_other_says_so_and_times_read_well() -> None:
+    joined = {"event": "peer-joined", "peer": "r1", "uptime_s": 3.0}
+    assert "whose name comes first tries" in report_page([RobotReport("r2", [joined])], "run")
+    assert "no other robot was heard" in report_page([RobotReport("r2", [])], "run")
+    assert span("2026-11-22T21:00:10+0000", "2026-11-22T21:05:00+0000") == "2026-11-22 21:00:10 to 21:05:00"
+    assert span("2026-11-22T23:59:10+0200", "2026-11-23T00:05:00+0200") == "2026-11-22 23:59:10+0200 to 2026-11-23 00:05:00+0200"
