@@ -25,7 +25,8 @@ from protocol.geometry import SE2
 from protocol.messages import GlobalMap
 from protocol.tiles import TileMap
 from tests.fleet.attackers import ATTACKS, Liar
-from tests.fleet.simulation import Explorer, Fleet, Node, random_world
+from tests.fleet.explorer import Explorer, random_world
+from tests.fleet.simulation import Fleet, Node
 
 ROBOTS, ATTACK_S = 5, 60.0
 

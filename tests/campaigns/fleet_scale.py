@@ -23,7 +23,8 @@ from agent.fleet.options import FleetOptions
 from agent.merging.result import MatchStatus, MergeResult
 from protocol.features import FeatureMap
 from protocol.geometry import SE2
-from tests.fleet.simulation import Explorer, Fleet, Node, judged, random_world
+from tests.fleet.explorer import Explorer, judged, random_world
+from tests.fleet.simulation import Fleet, Node
 
 SPACING_M, RADIUS_M, CELL_M = 9.0, 8.0, 1.0
 

@@ -13,7 +13,8 @@ from protocol.geometry import SE2
 from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from protocol.messages import Beat, FineTiles, GlobalMeta, Message, Stance, Statement
 from protocol.tiles import TileDelta
-from tests.fleet.simulation import Explorer, Fleet, Node, Tap
+from tests.fleet.explorer import Explorer
+from tests.fleet.simulation import Fleet, Node, Tap
 
 
 class Liar(Explorer):

@@ -18,7 +18,8 @@ from agent.fleet.options import FleetOptions
 from agent.fleet.state import FleetState
 from protocol.geometry import SE2
 from protocol.tiles import TileMap
-from tests.fleet.simulation import Explorer, Fleet, Link, Node, judged, random_world
+from tests.fleet.explorer import Explorer, judged, random_world
+from tests.fleet.simulation import Fleet, Link, Node
 
 FAULTS = ("loss", "delay", "duplicates", "partition", "one-way", "crash", "restart", "twin", "clock", "freeze", "unmerge")
 CELL_M, SIDE_M = 1.0, 48.0

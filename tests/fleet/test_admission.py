@@ -11,7 +11,8 @@ import pytest
 from protocol.geometry import SE2
 from protocol.grid import FREE, OCCUPIED, OccupancyGrid
 from tests.fleet.attackers import Liar
-from tests.fleet.simulation import Explorer, Fleet, random_world
+from tests.fleet.explorer import Explorer, random_world
+from tests.fleet.simulation import Fleet
 
 NAMES = ["r0", "r1", "r2"]
 

@@ -11,7 +11,7 @@ import pytest
 from agent.fleet.broken_word import grown, share_found_again, taken_back, witnessed
 from protocol.geometry import SE2
 from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from tests.fleet.simulation import random_world
+from tests.fleet.explorer import random_world
 
 WORLD = random_world(3, 48.0, 0.5, walls=60)
 CHANGES: dict[str, Callable[[OccupancyGrid], OccupancyGrid]] = {

@@ -10,7 +10,8 @@ from agent.fleet.effects import Match, MatchKind
 from agent.fleet.memory import FleetMemory, decode_memory
 from agent.merging.result import MergeResult
 from protocol.geometry import SE2
-from tests.fleet.simulation import Explorer, Fleet, Node, random_world, truthful
+from tests.fleet.explorer import Explorer, random_world
+from tests.fleet.simulation import Fleet, Node, truthful
 
 NAMES = ["r0", "r1", "r2"]
 MEMORY = FleetMemory(3, {"r1": SE2(1.5, -2.0, 0.25), "r7": SE2(0.0, 0.0, 3.0)}, ("r9",))
