@@ -18,6 +18,7 @@ from agent.runtime import snapshot as snapshots
 from agent.runtime.control import ControlError, Handler
 from agent.runtime.drawn_features import DrawnFeatures
 from agent.runtime.latest import Latest
+from agent.runtime.memory import give_back_memory
 from agent.runtime.metrics import metrics
 from protocol.features import FeatureMap
 from protocol.geometry import SE2
@@ -34,6 +35,7 @@ REOPEN_AFTER_S = 20.0  # stalls of 10 s are normal and mean nothing
 REOPEN_AT_MOST_EVERY_S = 300.0
 CHECKPOINT_WITHIN_S = 1.0
 MEMORY_EVERY_S = 2.0  # a transform that is refined all the time does not wear the disk out
+GIVE_BACK_EVERY_S = 10.0
 OPEN_EVERY_S = 2.0  # a client looks for its router this often
 
 
@@ -49,6 +51,7 @@ class Keeper:
         self._silent_since_s: float | None = None
         self._reopen_after_s = REOPEN_AFTER_S
         self._next_open_s = 0.0
+        self._next_give_back_s = 0.0
         self._seeds = tuple(node.config.fleet.connect)
         self._features = DrawnFeatures(self.grid)
         self.locators: list[str] = []
@@ -61,6 +64,9 @@ class Keeper:
             self.locators = node.fleet.exchange.locators()
         self.links = node.fleet.exchange.links()
         self._watch_links()
+        if time.monotonic() >= self._next_give_back_s:
+            self._next_give_back_s = time.monotonic() + GIVE_BACK_EVERY_S
+            give_back_memory()
         self.save_checkpoint()
         self._save_memory(node.fleet.memory(), MEMORY_EVERY_S)
         if node.state is not None and time.monotonic() >= self._next_save_s:

@@ -13,7 +13,7 @@ import time
 from typing import Any
 
 from tests.harness.fleet import Fleet
-from tests.harness.processes import print_row, resident_mb
+from tests.harness.processes import own_share_mb, print_row, resident_mb
 
 MAX_RSS_MB = 120.0
 
@@ -53,6 +53,7 @@ def campaign(args: argparse.Namespace) -> dict[str, Any]:
         if merged_s is not None:
             agreed_s = seconds_to_one_digest(fleet, names)
             rss_mb = max(rss_mb, *(resident_mb(fleet.agents[name].process.pid) for name in names))
+        total_mb = sum(own_share_mb(fleet.agents[name].process.pid) for name in names)
         statuses = [fleet.status(name) for name in names]
         for error in sorted(
             {f"{w['name']}: {w['error']}" for status in statuses for w in status.get("workers", []) if w["error"]}
@@ -66,6 +67,7 @@ def campaign(args: argparse.Namespace) -> dict[str, Any]:
         "seconds until all are in": merged_s,
         "seconds to one digest everywhere, mapping paused": agreed_s,
         "largest RSS MB": rss_mb,
+        "all together MB (PSS)": total_mb,
         "scans": sum(m["scans"] for m in mappings),
         "scans lost": sum(m["scans_lost"] for m in mappings),
         "worker errors": sum(w["errors"] for status in statuses if status for w in status["workers"]),

@@ -15,6 +15,15 @@ def resident_mb(pid: int) -> float:
     return _status(pid, "VmRSS:") / 1024
 
 
+def own_share_mb(pid: int) -> float:
+    """Memory in RAM, what is shared with other processes divided among them (PSS): the sum over robots is what they cost."""
+    try:
+        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    except OSError:
+        return 0.0
+    return next((int(line.split()[1]) for line in lines if line.startswith("Pss:")), 0) / 1024
+
+
 def threads(pid: int) -> int:
     return _status(pid, "Threads:")
 
