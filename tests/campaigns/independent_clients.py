@@ -44,7 +44,8 @@ ROBOT_SEED = 3
 BEGUN_BEFORE_S = 12.0  # a client has begun to read so long after the robot was started
 
 # Not here: lds2d reads an LDS-01 one degree off the maker's own ROS driver, which we follow; adafruit's express scan sends a
-# request without its operands, which no RPLIDAR understands; pyrplidar reads dense capsules with their bytes swapped.
+# request without its operands, which no RPLIDAR understands; pyrplidar reads dense capsules with their bytes swapped;
+# hokuyolx counts the angles of a URG from step 0.
 CASES = [  # (client, device, what the client is told, baud it is told)
     ("rplidar-roboticia", "rplidar-a1", "normal", 115200),
     ("rplidar-roboticia", "rplidar-a1", "express", 115200),
@@ -70,7 +71,6 @@ CASES = [  # (client, device, what the client is told, baud it is told)
     ("hokuyolx", "hokuyo-utm", "GE", 0),
     ("hokuyolx", "hokuyo-utm", "MD", 0),
     ("hokuyolx", "hokuyo-utm", "ME", 0),
-    ("hokuyolx", "hokuyo-urg", "MD", 0),
     ("rawlog-grabber", "hokuyo-urg", "CHokuyoURG", 0),
     ("rawlog-grabber", "hokuyo-utm", "CHokuyoURG", 0),
     ("rawlog-grabber", "sick-lms291", "CSickLaserSerial", 0),

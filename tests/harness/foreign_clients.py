@@ -122,7 +122,7 @@ def pylidar3(port: str, mode: str, baud: int) -> Rows:
 
 
 def hokuyolx(port: str, mode: str, baud: int) -> Rows:
-    """Speaks SCIP over TCP only, so the port is put behind a socket."""
+    """Speaks SCIP over TCP only, so the port is put behind a socket; it takes two scans in one piece for none: some are skipped."""
     from hokuyolx import HokuyoLX
 
     with socket.create_server(("127.0.0.1", 0)) as server, serial.Serial(port, baud or 115200, timeout=0.01) as line:
@@ -134,9 +134,9 @@ def hokuyolx(port: str, mode: str, baud: int) -> Rows:
         elif mode == "GE":
             scans = [lidar.get_intens()[1][:, 0] for _ in range(3)]
         elif mode == "ME":
-            scans = [scan[:, 0] for scan, *_ in itertools.islice(lidar.iter_intens(scans=3), 3)]
+            scans = [scan[:, 0] for scan, *_ in itertools.islice(lidar.iter_intens(scans=3, skips=4), 3)]
         else:
-            scans = [scan for scan, *_ in itertools.islice(lidar.iter_dist(scans=3), 3)]
+            scans = [scan for scan, *_ in itertools.islice(lidar.iter_dist(scans=3, skips=4), 3)]
         angles = lidar.get_angles()
         lidar.standby()
         return [[math.degrees(a), mm / 1e3] for scan in scans for a, mm in zip(angles, scan, strict=True)]
