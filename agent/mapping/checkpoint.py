@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from agent.mapping.estimate import MapperStatus
 from agent.mapping.likelihood import AREA
 from agent.mapping.log_odds import LogOddsGrid
-from agent.mapping.loop_closure import LoopCloser, LoopEdge
+from agent.mapping.loop_closure import LoopCloser
+from agent.mapping.path_graph import LoopEdge
 from agent.mapping.redrawing import Drawing, DrawnScan
 from protocol.geometry import SE2
 

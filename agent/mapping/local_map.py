@@ -12,10 +12,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.mapping.loop_closure import FitMaps, LoopClosed, LoopCloser, apart
+from agent.mapping.loop_closure import FitMaps, LoopClosed, LoopCloser
 from agent.mapping.motion import Motion
 from agent.mapping.options import MappingOptions
 from agent.mapping.particle_filter import ParticleFilter, composed
+from agent.mapping.path_graph import apart
 from agent.mapping.redrawing import Drawing
 from agent.mapping.relocalization import Relocalization
 from agent.mapping.scan_points import ScanPoints

@@ -20,12 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.mapping.particle_filter import composed, inverted
+from agent.mapping.path_graph import LoopEdge, apart, bent_path, pose_of, relative
 from agent.mapping.redrawing import Drawing
-from agent.mapping.scan_matching import Poses, difference
+from agent.mapping.scan_matching import Poses
 from agent.mapping.submaps import agreement, around, grid_of, points_of, recent, way_m
 from protocol.geometry import SE2
 from protocol.grid import OccupancyGrid
-from protocol.pose_graph import PoseGraph
 
 FitMaps = Callable[[OccupancyGrid, OccupancyGrid], SE2 | None]  # (local, given) -> T_given_local, where it is certain
 
@@ -39,21 +39,7 @@ CONFLICTS = 0.4  # something is wrong with the map
 BETTER = 0.05  # by how much the agreement has to grow
 NEGLIGIBLE_M, NEGLIGIBLE_RAD = 0.1, math.radians(1.0)  # corrections that the particles make themselves
 SAME_M, SAME_RAD = 0.4, math.radians(3.0)  # two answers that say the same
-NODES = 100  # of the graph: keyframes between two nodes move with them
-STEP_SIGMA = (0.01, 0.004)  # metres and radians, of each keyframe's step ...
-METRE_SIGMA = (0.03, 0.004)  # ... and of each metre
-BREAK_SIGMA = (2.0, 0.5)  # where the robot was lost and found
-LOOP_SIGMA = (0.05, math.radians(0.5))  # of a fit, and of how much a stretch is bent itself
 MOST_EDGES = 600
-
-
-@dataclass(frozen=True, slots=True)
-class LoopEdge:
-    """How two keyframes really lie."""
-
-    a: int  # the older
-    b: int
-    T_a_b: SE2
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +122,7 @@ class LoopCloser:
         first, self.pending = self.pending, edge
         if first is None or not says_the_same(first, edge, line):
             return None
-        bent = self._bent(line, [*self.edges, first, edge])
+        bent = bent_path(line, self._measured(line), self.breaks, [*self.edges, first, edge])
         if bent is None or not is_better(drawing, line, bent, first, edge):
             self.pending = None
             self.next_look = len(line) + PAUSE
@@ -154,39 +140,6 @@ class LoopCloser:
         shift = composed(self.steps_from[-1:], inverted(line[n - 1 : n]))
         return np.vstack([self.steps_from, composed(np.repeat(shift, len(line) - n, axis=0), line[n:])])
 
-    def _bent(self, line: Poses, loops: list[LoopEdge]) -> Poses | None:
-        """The path that fits steps and loops best; None when the last two loops are not among those that fit."""
-        nodes = np.unique(np.append(np.arange(0, len(line), math.ceil(len(line) / NODES)), len(line) - 1))
-        measured = self._measured(line)
-        chain = composed(inverted(measured[nodes[:-1]]), measured[nodes[1:]])
-        joints = [self._snapped(edge, nodes, measured) for edge in loops]
-        joints = [joint for joint in joints if joint[0] != joint[1]]
-        ia = np.array([*range(len(nodes) - 1), *(a for a, _, _ in joints)])
-        ib = np.array([*range(1, len(nodes)), *(b for _, b, _ in joints)])
-        between = np.vstack([chain, *(step[None] for _, _, step in joints)])
-        information = np.vstack(
-            [self._step_information(measured, nodes), np.repeat(diagonal(LOOP_SIGMA)[None], len(joints), axis=0)]
-        )
-        graph = PoseGraph(ia, ib, between, information, line[nodes].copy())
-        fits = graph.fit(is_sure=np.arange(len(ia)) < len(chain))
-        return spread(line, nodes, graph.x) if fits[-2:].all() else None
-
-    def _snapped(self, edge: LoopEdge, nodes: NDArray[np.int64], measured: Poses) -> tuple[int, int, NDArray[np.float64]]:
-        """An edge between the nodes nearest to its keyframes."""
-        a, b = (int(np.argmin(np.abs(nodes - k))) for k in (edge.a, edge.b))
-        T = relative(measured, int(nodes[a]), edge.a) @ edge.T_a_b @ relative(measured, edge.b, int(nodes[b]))
-        return a, b, np.array([T.x_m, T.y_m, T.theta_rad])
-
-    def _step_information(self, measured: Poses, nodes: NDArray[np.int64]) -> NDArray[np.float64]:
-        """(N - 1, 3, 3) of the way from node to node."""
-        steps = np.hypot(*np.diff(measured[:, :2], axis=0).T)
-        variances = np.square(np.array(STEP_SIGMA) + np.array(METRE_SIGMA) * steps[:, None])  # (K - 1, 2)
-        for k in self.breaks:
-            if 0 < k <= len(variances):
-                variances[k - 1] += np.square(BREAK_SIGMA)
-        sums = np.add.reduceat(variances, nodes[:-1], axis=0)
-        return np.stack([diagonal((math.sqrt(m), math.sqrt(rad))) for m, rad in sums])
-
 
 def is_better(drawing: Drawing, line: Poses, bent: Poses, *loops: LoopEdge) -> bool:
     """Whether what was seen at both ends of the loops agrees along the bent path, and better than before."""
@@ -203,31 +156,3 @@ def says_the_same(first: LoopEdge, second: LoopEdge, line: Poses) -> bool:
     place = pose_of(line[first.a]) @ first.T_a_b @ relative(line, first.b, second.b)
     off_m, off_rad = apart(place, pose_of(line[second.a]) @ second.T_a_b)
     return off_m < SAME_M and off_rad < SAME_RAD
-
-
-def spread(line: Poses, nodes: NDArray[np.int64], moved: Poses) -> Poses:
-    """(K, 3) the keyframes between the nodes, carried along by both, the nearer the more."""
-    k = np.arange(len(line))
-    before = np.clip(np.searchsorted(nodes, k, side="right") - 1, 0, len(nodes) - 2)
-    share = ((k - nodes[before]) / (nodes[before + 1] - nodes[before]))[:, None]
-    ends = [composed(moved[n], composed(inverted(line[nodes[n]]), line)) for n in (before, before + 1)]
-    return np.asarray(ends[0] + share * difference(ends[1], ends[0]))
-
-
-def relative(line: Poses, a: int, b: int) -> SE2:
-    return pose_of(line[a]).inverse() @ pose_of(line[b])
-
-
-def apart(a: SE2, b: SE2) -> tuple[float, float]:
-    """(metres, radians) between two poses."""
-    T = a.inverse() @ b
-    return math.hypot(T.x_m, T.y_m), abs(T.theta_rad)
-
-
-def pose_of(row: NDArray[np.float64]) -> SE2:
-    return SE2(float(row[0]), float(row[1]), math.remainder(float(row[2]), math.tau))
-
-
-def diagonal(sigma: tuple[float, float]) -> NDArray[np.float64]:
-    """(3, 3) information of independent errors in metres, metres, radians."""
-    return np.diag([sigma[0] ** -2, sigma[0] ** -2, sigma[1] ** -2])

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from agent.mapping.estimate import ScanOutcome
-from agent.mapping.loop_closure import FitMaps, spread
+from agent.mapping.loop_closure import FitMaps
 from agent.mapping.mapper import Mapper
 from agent.mapping.options import MappingOptions
+from agent.mapping.path_graph import spread
 from agent.runtime.own_loops import fit_in_own_map
 from hw.readings import LaserScan, Odometry
 from protocol.geometry import SE2
