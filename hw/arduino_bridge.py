@@ -13,7 +13,7 @@ from __future__ import annotations
 import re
 
 from hw.framing import Counters
-from hw.odometry import TickSample, WheelGeometry
+from hw.odometry import Quiet, TickSample, WheelGeometry
 
 BAUD_RATES = (57600, 115200)  # the sketch's own; many forks
 ASK_ENCODERS = b"e\r"
@@ -38,7 +38,7 @@ def decode_counts(line: bytes) -> tuple[int, int] | None:
     return (left, right) if min(left, right) >= -(2**31) and max(left, right) < 2**31 else None
 
 
-class ArduinoBridge:
+class ArduinoBridge(Quiet):
     """`BaseProtocol`: asks for the counters; the geometry is the builder's own and comes from the URL."""
 
     baud_rates: tuple[int, ...] = BAUD_RATES
@@ -53,10 +53,6 @@ class ArduinoBridge:
     def start_requests(self) -> list[bytes]:
         """End whatever half a command an earlier program left."""
         return [b"\r"]
-
-    def stop_requests(self) -> list[bytes]:
-        """Nothing: it only answers."""
-        return []
 
     def poll_request(self) -> bytes:
         """See `BaseProtocol`."""

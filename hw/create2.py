@@ -11,7 +11,7 @@ import struct
 from collections.abc import Mapping
 
 from hw.framing import ByteWindow, Counters, SizedFrames
-from hw.odometry import TickSample, WheelGeometry
+from hw.odometry import Quiet, TickSample, WheelGeometry
 
 HEADER = b"\x13"
 START, SAFE, STREAM, PAUSE_STREAM = 128, 131, 148, 150
@@ -64,11 +64,10 @@ def drive_direct(left_mm_s: int, right_mm_s: int) -> bytes:
     return struct.pack(">Bhh", 145, right_mm_s, left_mm_s)
 
 
-class Create2:
+class Create2(Quiet):
     """`BaseProtocol` of a Create 2."""
 
     baud_rates: tuple[int, ...] = (115200, 19200)
-    poll_period_s = 0.0
 
     def __init__(self, geometry: WheelGeometry | None = None) -> None:
         self.geometry = geometry or WheelGeometry(METRES_PER_TICK, TRACK_M, MAX_SPEED_MPS)
@@ -81,9 +80,6 @@ class Create2:
 
     def stop_requests(self) -> list[bytes]:
         return [bytes((PAUSE_STREAM, 0))]
-
-    def poll_request(self) -> bytes:
-        return b""
 
     def feed(self, data: bytes) -> list[TickSample]:
         """Samples that these bytes complete."""

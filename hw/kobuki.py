@@ -10,7 +10,7 @@ import struct
 from dataclasses import dataclass
 
 from hw.framing import ByteWindow, Counters, SizedFrames
-from hw.odometry import TickSample, WheelGeometry
+from hw.odometry import Quiet, TickSample, WheelGeometry
 from hw.rplidar_wire import xor8
 
 BAUD_RATES = (115200,)
@@ -78,29 +78,16 @@ def request_extra(flags: int) -> bytes:
     return encode(struct.pack("<BBH", REQUEST_EXTRA, 2, flags))
 
 
-class Kobuki:
+class Kobuki(Quiet):
     """`BaseProtocol`: it streams from power-up."""
 
     baud_rates: tuple[int, ...] = BAUD_RATES
-    poll_period_s = 0.0
 
     def __init__(self, geometry: WheelGeometry | None = None) -> None:
         self.geometry = geometry or GEOMETRY
         self.counters = Counters()
         self._window = ByteWindow(self.counters, 4096)
         self._frames = SizedFrames(HEADER, 3, 259, lambda data: data[2] + 4, lambda frame: decode(frame) is not None)
-
-    def start_requests(self) -> list[bytes]:
-        """Nothing: it streams."""
-        return []
-
-    def stop_requests(self) -> list[bytes]:
-        """Nothing: it never moved."""
-        return []
-
-    def poll_request(self) -> bytes:
-        """Nothing: it streams."""
-        return b""
 
     def feed(self, data: bytes) -> list[TickSample]:
         """See `BaseProtocol`."""

@@ -65,6 +65,24 @@ class BaseProtocol(Protocol):
     def feed(self, data: bytes) -> list[TickSample]: ...
 
 
+class Quiet:
+    """The part of a `BaseProtocol` that most bases share: nothing needs to be said to start, to stop or to be told."""
+
+    poll_period_s = 0.0
+
+    def start_requests(self) -> list[bytes]:
+        """Nothing."""
+        return []
+
+    def stop_requests(self) -> list[bytes]:
+        """Nothing: it never moved."""
+        return []
+
+    def poll_request(self) -> bytes:
+        """Nothing: it streams by itself."""
+        return b""
+
+
 def tick_delta(before: int, after: int, bits: int) -> int:
     """Signed shortest way from one counter value to the next on a ring of 2**bits."""
     half = 1 << (bits - 1)

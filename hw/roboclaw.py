@@ -13,7 +13,7 @@ import binascii
 import struct
 
 from hw.framing import Counters
-from hw.odometry import TickSample, WheelGeometry
+from hw.odometry import Quiet, TickSample, WheelGeometry
 
 BAUD_RATES = (38400, 115200, 460800, 230400, 57600, 19200, 9600)  # 38400 is the factory's; over USB any will do
 FIRST_ADDRESS, LAST_ADDRESS = 0x80, 0x87
@@ -57,7 +57,7 @@ def decode_counts(address: int, answer: bytes) -> tuple[int, int] | None:
     return left, right
 
 
-class RoboClaw:
+class RoboClaw(Quiet):
     """`BaseProtocol`: asks for both counters; motor 1 is the left wheel."""
 
     baud_rates: tuple[int, ...] = BAUD_RATES
@@ -68,14 +68,6 @@ class RoboClaw:
         self.counters = Counters()
         self._address = address
         self._pending = bytearray()
-
-    def start_requests(self) -> list[bytes]:
-        """Nothing: it drops half a command by itself after 10 ms."""
-        return []
-
-    def stop_requests(self) -> list[bytes]:
-        """Nothing: it only answers."""
-        return []
 
     def poll_request(self) -> bytes:
         """See `BaseProtocol`."""

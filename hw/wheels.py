@@ -13,7 +13,7 @@ import binascii
 import struct
 from dataclasses import dataclass, field
 
-from hw.odometry import TickSample, WheelGeometry
+from hw.odometry import Quiet, TickSample, WheelGeometry
 
 BAUD_RATES = (115200,)
 PROTOCOL_VERSION = 1
@@ -178,11 +178,10 @@ class WheelDecoder:
         self._sequence = frame.sequence
 
 
-class WheelBoard:
+class WheelBoard(Quiet):
     """`BaseProtocol` of a WT1 board: it streams by itself and tells its own geometry."""
 
     baud_rates: tuple[int, ...] = BAUD_RATES
-    poll_period_s = 0.0
 
     def __init__(self, geometry: WheelGeometry | None = None, max_speed_mps: float = 3.0) -> None:
         self._is_given = geometry is not None
@@ -190,15 +189,6 @@ class WheelBoard:
         self.geometry = geometry or WheelGeometry(0.0001, 0.3, max_speed_mps)
         self.is_geometry_known = self._is_given
         self.decoder = WheelDecoder()
-
-    def start_requests(self) -> list[bytes]:
-        return []
-
-    def stop_requests(self) -> list[bytes]:
-        return []
-
-    def poll_request(self) -> bytes:
-        return b""
 
     def feed(self, data: bytes) -> list[TickSample]:
         """Samples from the first moment at which a tick's worth is known."""

@@ -122,7 +122,7 @@ def pylidar3(port: str, mode: str, baud: int) -> Rows:
 
 
 def hokuyolx(port: str, mode: str, baud: int) -> Rows:
-    """Speaks SCIP over TCP only, so the port is put behind a socket; it takes two scans in one piece for none: some are skipped."""
+    """Speaks SCIP over TCP only, so the port is put behind a socket; it cannot part two scans, so some are left out."""
     from hokuyolx import HokuyoLX
 
     with socket.create_server(("127.0.0.1", 0)) as server, serial.Serial(port, baud or 115200, timeout=0.01) as line:
