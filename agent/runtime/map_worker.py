@@ -9,6 +9,7 @@ import logging
 import math
 import queue
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -17,11 +18,13 @@ from agent.mapping.mapper import Mapper
 from agent.runtime.latest import Latest
 from agent.runtime.pace import REAL, Pace
 from agent.runtime.sensing import Readings
+from protocol.geometry import SE2
 
 log = logging.getLogger(__name__)
 
 WAIT_S = 0.25
 WAIT_FOR_ODOMETRY_S = 0.12  # two samples of a 20 Hz encoder board
+MAX_LOOP_PLACES = 100
 ESTIMATE_PERIOD_S = 1.0  # an estimate copies the whole grid; peers and the page need no more
 
 
@@ -34,6 +37,7 @@ class MapWorker:
         self.mapper = mapper
         self.estimates: Latest[MapEstimate] = Latest()  # for the snapshot worker
         self.newest: MapEstimate | None = None  # for whoever looks; replaced as a whole
+        self.loop_places: deque[SE2] = deque(maxlen=MAX_LOOP_PLACES)  # where the robot was when a loop was closed, to look at
         self.is_paused = False
         self.scans = 0
         self.scan_cpu_s = 0.0  # CPU of this thread spent on scans
@@ -70,5 +74,9 @@ class MapWorker:
             self.publish()
 
     def publish(self) -> None:
-        self.newest = self.mapper.estimate()
+        before, self.newest = self.newest, self.mapper.estimate()
+        if before is not None and self.newest.epoch != before.epoch:
+            self.loop_places.clear()
+        elif before is not None and self.newest.loops_closed > before.loops_closed:
+            self.loop_places.append(self.newest.T_map_robot)
         self.estimates.put(self.newest)

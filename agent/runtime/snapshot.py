@@ -103,6 +103,7 @@ def mapping(node: Node) -> dict[str, Any]:
             "known_m2": round(estimate.grid.known_area_m2(), 2),
             "particles": round(estimate.effective_particles, 1),
             "loops_closed": estimate.loops_closed,
+            "closures": [plain_pose(place)[:2] for place in list(worker.loop_places)],
             "pose": plain_pose(estimate.T_map_robot),
             "pose_stamp_s": estimate.stamp_s,
         }

@@ -20,6 +20,8 @@ def page_facts(status: Mapping[str, Any]) -> dict[str, Any]:
     facts = {key: status[key] for key in KEYS if key in status}
     facts["attempts"] = list(status.get("attempts", []))[-NEWEST_ATTEMPTS:]
     facts["is_mapping"] = bool(status.get("mapping"))
+    closed = status.get("mapping", {}).get("loops_closed", 0)
+    facts["facts"] = {**status.get("facts", {}), **({"loops closed": str(closed)} if closed else {})}
     facts["closures"] = status.get("mapping", {}).get("closures", [])
     facts["peers"] = [
         {key: peer[key] for key in PEER_KEYS if key in peer} | {"age_s": round(peer.get("age_s") or 0)}

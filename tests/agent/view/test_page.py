@@ -43,6 +43,7 @@ class Fleet:
         self.grids = {"global": room(120), "r1": room(100), "r2": room(80)}
         self.undecided: list[dict[str, Any]] = []
         self.x_m = 2.0
+        self.mapping: dict[str, Any] = {"scans": 12}
 
     def status(self) -> Mapping[str, Any]:
         maps = {
@@ -57,7 +58,7 @@ class Fleet:
             "frames": {name: [0, 0, 0] for name in robots},
             "poses": {name: [self.x_m, 2, 0.5] for name in robots},
             "maps": maps,
-            "mapping": {},
+            "mapping": self.mapping,
             "peers": [{"robot": name, "state": "alive", "age_s": 1, "match_factor": 0.97} for name in robots if name != "r1"],
             "attempts": [
                 {"peer": "<b>r2</b>", "status": "no", "match_factor": 0.7, "overlap_m2": 12, "reason": "little wall"},
@@ -163,6 +164,17 @@ def test_a_map_that_fits_in_two_places_is_shown_in_both(browser: Browser, server
     assert said == "r9: 37 positions tried; the best has 19.4 m of common wall, the next 17.9 m. On the map: 1 to 2."
     browser.run("document.getElementById('mark-candidates').click()")
     until(lambda: colours(browser, ghost) == 0)
+
+
+def test_places_where_a_loop_was_closed_are_marked(browser: Browser, server: ViewServer, fleet: Fleet) -> None:
+    ring = (0x9A, 0x67, 0x00)
+    show(browser, server)
+    assert browser.run("document.getElementById('mark-closures')") is None  # nothing to show, so no box
+    fleet.mapping = {"scans": 13, "loops_closed": 1, "closures": [[3, 3]]}
+    until(lambda: colours(browser, ring) > 30)
+    assert "loops closed1" in browser.run("document.getElementById('self').textContent")
+    browser.run("document.getElementById('mark-closures').click()")
+    until(lambda: colours(browser, ring) == 0)
 
 
 def test_a_button_stays_under_the_finger_while_news_comes(browser: Browser, server: ViewServer, fleet: Fleet) -> None:
