@@ -20,11 +20,13 @@ EXAMPLES = """\
   mapquilt run --lidar replay:lidar.rec --wheels replay:wheels.rec
 """
 
+START_S = 20.0  # a device whose rate must be found, and whose motor must spin up, takes some of it
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("device", metavar="DEVICE", help="for example ld06:/dev/ttyUSB0")
     parser.add_argument("file", metavar="FILE", type=Path)
-    parser.add_argument("--seconds", type=float, default=0.0, help="stop after so long (0: Ctrl-C)")
+    parser.add_argument("--seconds", type=float, default=0.0, help="stop so long after the first reading (0: Ctrl-C)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -47,11 +49,13 @@ def run(args: argparse.Namespace) -> int:
 def _record(device: Device, recorder: Recorder, seconds: float) -> int:
     """Let the device run for so long, or until Ctrl-C; how many readings it gave."""
     device.tap = recorder
-    end_s = time.monotonic() + (seconds or float("inf"))
+    end_s = time.monotonic() + (seconds + START_S if seconds else float("inf"))
+    has_begun = False
     try:
         with device:
             while time.monotonic() < end_s:
-                device.read(0.2)
+                if device.read(0.2) is not None and seconds and not has_begun:
+                    has_begun, end_s = True, time.monotonic() + seconds
     except KeyboardInterrupt:
         pass
     return device.health().readings

@@ -109,8 +109,9 @@ def line(scan: LaserScan, health: DeviceHealth) -> str:
     counts = np.histogram(scan.ranges_m[np.isfinite(scan.ranges_m)], np.linspace(0.0, scan.range_max_m, BINS + 1))[0]
     share = counts / max(1, counts.max())
     bars = "".join(BARS[min(len(BARS) - 1, int(np.ceil(s * (len(BARS) - 1))))] for s in share)
+    rate = f"{health.rate_hz:5.1f}" if health.rate_hz else "    -"  # of a single scan there is none
     return (
-        f"{health.model:<14} {health.state.value:<8} {facts['rate_hz']:5.1f} Hz {facts['points']:5d} points "
+        f"{health.model:<14} {health.state.value:<8} {rate} Hz {facts['points']:5d} points "
         f"{facts['coverage']:4.0%} of the circle  nearest {facts['nearest_m']} m  0 {bars} {scan.range_max_m:g} m"
         + (f"  {health.bad_frames} bad frames" if health.bad_frames else "")
     )
