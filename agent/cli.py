@@ -9,8 +9,11 @@ import argparse
 import difflib
 import importlib
 import os
+import signal
 import sys
+import threading
 import traceback
+from signal import default_int_handler
 from types import ModuleType
 
 from agent import __version__
@@ -95,8 +98,18 @@ def _dispatch(argv: list[str]) -> int:
 
 
 def load_command(name: str) -> ModuleType:
-    """The module of a command, imported now."""
-    return importlib.import_module(COMMANDS[name][0])
+    """The module of a command, imported now.
+
+    Ctrl-C meanwhile ends the process at once: NumPy takes a KeyboardInterrupt in its import for a broken installation.
+    """
+    is_ours = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is default_int_handler
+    if is_ours:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    try:
+        return importlib.import_module(COMMANDS[name][0])
+    finally:
+        if is_ours:
+            signal.signal(signal.SIGINT, default_int_handler)
 
 
 def command_parser(name: str) -> argparse.ArgumentParser:

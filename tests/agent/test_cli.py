@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import re
 import shlex
+import signal
 import subprocess
 import sys
 
@@ -95,3 +96,12 @@ def test_the_examples_of_a_command_can_be_typed(name: str, capsys: pytest.Captur
             command_parser(words[0]).parse_args(words[1:])
         except SystemExit:
             pytest.fail(f"{line}: {capsys.readouterr().err}")
+
+
+def test_ctrl_c_while_libraries_load_ends_at_once_and_is_no_bug() -> None:
+    probe = (
+        "import importlib, os, signal; from agent import cli; signal.signal(signal.SIGINT, signal.default_int_handler);"
+        "importlib.import_module = lambda name: os.kill(os.getpid(), signal.SIGINT); cli.main(['run'])"
+    )
+    done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (-signal.SIGINT, "")
