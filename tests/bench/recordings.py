@@ -18,7 +18,6 @@ from protocol.geometry import SE2
 SHARED = Path(os.environ.get("MAPQUILT_SHARED", Path(__file__).resolve().parents[3] / "shared"))
 SPARSE_M = 0.2  # scans farther apart than this have odometry's shape between them, not a straight line
 RELATION_OFFSET_S = {"intel": 976052857.337, "freiburg-079": 1211.385}
-MAX_RANGE_M = {"intel": 50.0, "freiburg-079": 50.0, "freiburg-campus": 80.0, "acapulco": 80.0, "seattle": 80.0}
 
 
 @dataclass(frozen=True, slots=True)
