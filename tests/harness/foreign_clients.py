@@ -209,7 +209,7 @@ def basicmicro(port: str, mode: str, baud: int) -> Rows:
         is_read, left, right = board.GetEncoders(0x80)
         (is_left, one, _), (is_right, two, _) = board.ReadEncM1(0x80), board.ReadEncM2(0x80)
         assert is_read and is_left and is_right, "an encoder is not read"
-        assert abs(one - left) < 200 and abs(two - right) < 200, "two ways to read, two counts"
+        assert abs(one - left) < 2000 and abs(two - right) < 2000, "two ways to read, two counts"
         return [left, right]
 
     return ticks(read)
