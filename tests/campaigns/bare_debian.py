@@ -100,6 +100,7 @@ def prepare(base: Path, wheels: Path, release: str) -> None:
 @contextlib.contextmanager
 def copied(base: Path, wheels: Path, root: Path) -> Iterator[Path]:
     subprocess.run(["cp", "-a", base, root], check=True)
+    (root / "etc/hosts").write_text("127.0.0.1 localhost\n::1 localhost\n")  # Debian's installer writes it, debootstrap does not
     shutil.copytree(wheels, root / "wheels")
     subprocess.run(["git", "clone", "-q", str(ROOT), root / "src"], check=True)
     yield root
