@@ -25,6 +25,12 @@ FINE_GATES_M = (0.3, 0.2, 0.15, 0.15)
 _Floats = NDArray[np.floating]
 _STIFFNESS = 1e-3  # times the points: keeps an unobservable direction still
 
+# How far a refined transform may be off.  Points err together: all of a wall is drawn on one side of its cells' middles, and a
+# map bends as a whole.  So one point in fourteen tells something new, and none of them how one map is bent against the other.
+_POINTS_THAT_ERR_ALIKE = 14.0  # measured, like the other two: squared normalised errors have a trimmed mean of 1 a dimension
+_BENT_RAD = 4e-4
+_PRIOR_POINTS = 10.0  # of residual SIGMA_M, believed before any is seen: a handful that agrees by chance proves little
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Side:
@@ -62,7 +68,14 @@ class Normal:
     g: NDArray[np.float64]  # (C, 3)
     centre: NDArray[np.float64]  # (C, 2) in our frame
     inliers: NDArray[np.float64]  # (C,)
+    weight: NDArray[np.float64]  # (C,) of all inliers
     squares: NDArray[np.float64]  # (C,) weighted sum of squared residuals
+
+    def covariances(self) -> NDArray[np.float64]:
+        """(C, 3, 3) of shifts and turn about the middle of the inliers, as wide as this pair's own residuals say."""
+        spread = (self.squares + _PRIOR_POINTS * SIGMA_M**2) / (self.weight + _PRIOR_POINTS)
+        about = np.linalg.inv(self.H + 1e-3 * np.eye(3)) * (_POINTS_THAT_ERR_ALIKE * spread)[:, None, None]
+        return np.asarray(about + np.diag([0.0, 0.0, _BENT_RAD**2]))
 
 
 def refined(ours: Side, theirs: Side, poses: Poses, gates_m: tuple[float, ...] = GATES_M) -> Poses:
@@ -109,7 +122,7 @@ def normal_equations(ours: Side, theirs: Side, poses: Poses, gate_m: float) -> N
     weighted = J * w[:, None, :]
     H = (weighted @ J.transpose(0, 2, 1)).astype(np.float64)
     g = (weighted @ e[..., None])[..., 0].astype(np.float64)
-    return Normal(H, g, centre, inliers, (w * e * e).sum(axis=1).astype(np.float64))
+    return Normal(H, g, centre, inliers, total.astype(np.float64), (w * e * e).sum(axis=1).astype(np.float64))
 
 
 def _partners(points: Side, lines: Side, poses: Poses) -> tuple[_Floats, ...]:
