@@ -19,6 +19,8 @@ from types import ModuleType
 from agent import __version__
 from agent.exits import BUG, EXIT_CODES, INTERRUPTED, OK, USAGE, CommandError
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when NumPy loads: our matrices are small, its idle threads spin
+
 COMMANDS: dict[str, tuple[str, str]] = {  # name: (module, what it does)
     "run": ("agent.commands.run", "be a robot: map, meet the others, merge"),
     "demo": ("agent.commands.demo", "a fleet of simulated robots on this machine, and a page to look at it"),
