@@ -64,7 +64,7 @@ class MatchOptions:
     max_rival_share: float = 0.72  # of the best score
     min_observability_m: float = 2.0  # of wall that fixes the worst-seen direction, and
     min_observable_share: float = 0.1  # of agreeing wall: along a long corridor two metres of cross wall are an accident
-    unsuspicious: float = 0.5  # most true pairs look less like another place of the same kind; above it more margin is asked for
+    unsuspicious: float = 0.3  # most true pairs look less like another place of the same kind; above it more margin is asked for
     distinctive_m: float = 12.0  # agreeing short wall and clutter; with less, any suspicion asks for more margin
     mirror_test: bool = True  # try the reflection before merging: 40 ms a merge, and look-alikes in mirror image do not pass
     thorough: bool = True  # a second, slower pass when the first ends undecided
