@@ -14,8 +14,8 @@ from hw.sick_lms import RATE_CODES, SickLms
 from hw.spinning import SpinningLidar
 from hw.urls import DeviceUrl
 from hw.xv11 import LDS01, XV11, Kind, Xv11
-from hw.ydlidar import MODELS as YDLIDAR_MODELS
 from hw.ydlidar import YdLidar
+from hw.ydlidar_wire import MODELS as YDLIDAR_MODELS
 
 COMMON = ("baud", "range_min", "range_max")
 Build = Callable[[DeviceUrl], Driver]

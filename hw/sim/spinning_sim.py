@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hw import ld06, xv11, ydlidar
+from hw import ld06, xv11, ydlidar_wire
 from hw.rplidar_wire import Descriptor
 from hw.sim.sight import Floats, Sight, Turntable, joined, solve_angles, wrap_ms
 
@@ -68,7 +68,7 @@ class YdlidarSim:
     """X2 (one-way), X4 and G2 (two-way, the G2 with intensity)."""
 
     def __init__(self, model: str, sight: Sight) -> None:
-        self._model, self._unit, self._sight = ydlidar.MODELS[model], YDLIDARS[model], sight
+        self._model, self._unit, self._sight = ydlidar_wire.MODELS[model], YDLIDARS[model], sight
         self.baud = self._model.baud
         self._head = Turntable.in_frames(self._unit.turn_hz, round(self._unit.samples_per_s / self._unit.turn_hz), 40)
         self._is_sending = not self._model.is_two_way
@@ -95,15 +95,15 @@ class YdlidarSim:
                 del self._inbox[0]
 
     def _obey(self, code: int, now_s: float) -> None:
-        if code in (ydlidar.STOP, ydlidar.FORCE_STOP, ydlidar.RESET, OLD_RESET):
+        if code in (ydlidar_wire.STOP, ydlidar_wire.FORCE_STOP, ydlidar_wire.RESET, OLD_RESET):
             self._is_sending = False
-        elif code == ydlidar.INFO:
-            body = ydlidar.info_body(self._unit.number, (1, 5), 1, list(range(10)) + [0] * 6)
-            self._outbox += ydlidar.answer(ydlidar.INFO_TYPE, body)
-        elif code in (ydlidar.HEALTH, OLD_HEALTH):
-            self._outbox += ydlidar.answer(ydlidar.HEALTH_TYPE, bytes((self._status, 0, 0)))
-        elif code in (ydlidar.SCAN, 0x61):
-            self._outbox += Descriptor(5, True, ydlidar.SCAN_TYPE).encode()
+        elif code == ydlidar_wire.INFO:
+            body = ydlidar_wire.info_body(self._unit.number, (1, 5), 1, list(range(10)) + [0] * 6)
+            self._outbox += ydlidar_wire.answer(ydlidar_wire.INFO_TYPE, body)
+        elif code in (ydlidar_wire.HEALTH, OLD_HEALTH):
+            self._outbox += ydlidar_wire.answer(ydlidar_wire.HEALTH_TYPE, bytes((self._status, 0, 0)))
+        elif code in (ydlidar_wire.SCAN, 0x61):
+            self._outbox += Descriptor(5, True, ydlidar_wire.SCAN_TYPE).encode()
             self._is_sending = True
             self._head.restart(now_s)
 
@@ -117,18 +117,18 @@ class YdlidarSim:
         q6 = np.rint(index * 23040 / self._head.beams_per_turn)
         # The host spreads the beams of a packet evenly between its first and last angle.
         turn_deg = np.concatenate([np.linspace(a[0], a[-1], len(a)) for a in np.split(q6, cuts)]) / 64.0
-        limits_m = (ydlidar.RANGE_MIN_M, self._model.range_max_m)
-        mm = solve_angles(self._sight, times_s, turn_deg, ydlidar.correction_deg, limits_m)
+        limits_m = (ydlidar_wire.RANGE_MIN_M, self._model.range_max_m)
+        mm = solve_angles(self._sight, times_s, turn_deg, ydlidar_wire.correction_deg, limits_m)
         return out + b"".join(self._packet(a, d) for a, d in zip(np.split(q6, cuts), np.split(mm, cuts), strict=True))
 
     def _packet(self, q6: Floats, mm: Floats) -> bytes:
         width, hz = self._unit.sample_bytes, self._unit.turn_hz
         intensities = (120,) * len(mm) if width > 2 else ()
         words = tuple(int(4 * v) for v in mm)
-        packet = ydlidar.encode(ydlidar.Packet(False, 0.0, int(q6[0]), int(q6[-1]), words, intensities), width)
+        packet = ydlidar_wire.encode(ydlidar_wire.Packet(False, 0.0, int(q6[0]), int(q6[-1]), words, intensities), width)
         if q6[0] > 0:
             return packet
-        return ydlidar.encode(ydlidar.Packet(True, hz, 0, 0, (0,), (0,) if width > 2 else ()), width) + packet
+        return ydlidar_wire.encode(ydlidar_wire.Packet(True, hz, 0, 0, (0,), (0,) if width > 2 else ()), width) + packet
 
 
 class NeatoSim:

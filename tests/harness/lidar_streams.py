@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hw import ld06, rplidar_hq, rplidar_wire, scip, sick_lms, xv11, ydlidar
+from hw import ld06, rplidar_hq, rplidar_wire, scip, sick_lms, xv11, ydlidar_wire
 from hw.driver import Driver
 from hw.hokuyo import Hokuyo
 from hw.ld06 import Ld06
@@ -148,17 +148,17 @@ def rplidar_hq_frames(seconds: float = 2.0, rate: int = 9600, hz: float = 10.0) 
 def ydlidar_packets(model: str = "g4", sample_bytes: int = 2, seconds: float = 2.0, rate: int = 5000, hz: float = 10.0) -> Stream:
     """Packets of 40 samples, a start packet each turn; angles corrected as the triangle models ask."""
     per_turn = round(rate / hz)
-    out = [ydlidar.encode(ydlidar.Packet(True, hz, 0, 0, (0,), (0,) if sample_bytes > 2 else ()), sample_bytes)]
+    out = [ydlidar_wire.encode(ydlidar_wire.Packet(True, hz, 0, 0, (0,), (0,) if sample_bytes > 2 else ()), sample_bytes)]
     for first in range(0, per_turn, 40):
         index = np.arange(first, min(first + 40, per_turn))
         q6 = np.round(index * 23040 / per_turn)
         turn_deg = np.linspace(q6[0], q6[-1], len(index)) / 64.0
         mm = _mm(turn_deg)
         for _ in range(6):
-            mm = _mm(turn_deg + ydlidar.correction_deg(mm))
+            mm = _mm(turn_deg + ydlidar_wire.correction_deg(mm))
         intensities = tuple(_ints(index % 200)) if sample_bytes > 2 else ()
-        packet = ydlidar.Packet(False, 0.0, int(q6[0]), int(q6[-1]), tuple(_ints(4 * mm)), intensities)
-        out.append(ydlidar.encode(packet, sample_bytes))
+        packet = ydlidar_wire.Packet(False, 0.0, int(q6[0]), int(q6[-1]), tuple(_ints(4 * mm)), intensities)
+        out.append(ydlidar_wire.encode(packet, sample_bytes))
     name = f"ydlidar-{sample_bytes}B"
     return Stream(name, lambda: YdLidar(model), b"".join(out) * round(seconds * hz), seconds)
 

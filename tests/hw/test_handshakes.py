@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from hw import rplidar_wire, scip, sick_lms, ydlidar
+from hw import rplidar_wire, scip, sick_lms, ydlidar_wire
 from hw.driver import Driver
 from hw.health import DeviceHealth
 from hw.hokuyo import Hokuyo
@@ -246,13 +246,13 @@ class FakeYdLidar:
         self.stream = STREAMS["ydlidar-3B"](seconds=1.0)
 
     def __call__(self, port: TalkingPort, data: bytes) -> None:
-        if data == ydlidar.command(ydlidar.STOP):
+        if data == ydlidar_wire.command(ydlidar_wire.STOP):
             port.silence()
-        elif data == ydlidar.command(ydlidar.INFO):
-            port.say(ydlidar.answer(ydlidar.INFO_TYPE, ydlidar.info_body(15, (1, 5), 1, [2, 0, 1, 9] * 4)))
-        elif data == ydlidar.command(ydlidar.HEALTH):
-            port.say(ydlidar.answer(ydlidar.HEALTH_TYPE, b"\0\0\0"))
-        elif data == ydlidar.command(ydlidar.SCAN):
+        elif data == ydlidar_wire.command(ydlidar_wire.INFO):
+            port.say(ydlidar_wire.answer(ydlidar_wire.INFO_TYPE, ydlidar_wire.info_body(15, (1, 5), 1, [2, 0, 1, 9] * 4)))
+        elif data == ydlidar_wire.command(ydlidar_wire.HEALTH):
+            port.say(ydlidar_wire.answer(ydlidar_wire.HEALTH_TYPE, b"\0\0\0"))
+        elif data == ydlidar_wire.command(ydlidar_wire.SCAN):
             port.say(b"\xa5\x5a\x05\x00\x00\x40\x81")
             port.stream(self.stream.data, self.stream.bytes_per_s)
 

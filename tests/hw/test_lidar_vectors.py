@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hw import ld06, rplidar_wire, scip, sick_lms, xv11, ydlidar
+from hw import ld06, rplidar_wire, scip, sick_lms, xv11, ydlidar_wire
 from hw.rplidar import Rplidar
 from hw.rplidar_nodes import Node
 
@@ -88,19 +88,19 @@ def test_ldrobot_packet(vector: dict[str, Any]) -> None:
 @pytest.mark.parametrize("vector", _of("ydlidar", "decode"))
 def test_ydlidar_packet(vector: dict[str, Any]) -> None:
     data, expect = bytes.fromhex(vector["hex"]), vector["expect"]
-    packet = ydlidar.decode(data)
+    packet = ydlidar_wire.decode(data)
     assert packet is not None
     assert (int(packet.is_start), len(packet.samples), packet.first_q6 / 64) == (expect["ct"], expect["n"], expect["fsa"])
     assert packet.last_q6 / 64 == expect.get("lsa", packet.last_q6 / 64)
     mm = [word / 4 for word in packet.samples]
     assert mm == expect["mm"] if "mm" in expect else mm[: len(expect["mm_first"])] == expect["mm_first"]
-    assert ydlidar.encode(packet) == data
+    assert ydlidar_wire.encode(packet) == data
 
 
 def test_ydlidar_angles_are_corrected_as_the_vendor_says() -> None:
-    assert ydlidar.correction_deg(np.array([1000.0, 8000.0, 0.0])) == pytest.approx([-6.7622, -7.8374, 0.0], abs=1e-4)
+    assert ydlidar_wire.correction_deg(np.array([1000.0, 8000.0, 0.0])) == pytest.approx([-6.7622, -7.8374, 0.0], abs=1e-4)
     raw = 326.5 + np.arange(4) * (347.578125 - 326.5) / 35
-    corrected = raw + ydlidar.correction_deg(np.array([298.25, 297.25, 297.25, 297.25]))
+    corrected = raw + ydlidar_wire.correction_deg(np.array([298.25, 297.25, 297.25, 297.25]))
     assert corrected == pytest.approx([322.651, 323.267, 323.869, 324.472], abs=1e-3)
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hw import ld06, scip, sick_lms, xv11, ydlidar
+from hw import ld06, scip, sick_lms, xv11, ydlidar_wire
 from hw.hokuyo import Hokuyo
 from hw.sick_lms import SickLms
 from hw.ydlidar import YdLidar
@@ -22,8 +22,8 @@ def test_ydlidar_packets_of_every_width(data: st.DataObject, n: int, width: int)
     samples = tuple(data.draw(st.lists(words, min_size=n, max_size=n)))
     most = {2: 0, 3: 255, 4: 65535}[width]
     intensities = tuple(data.draw(st.lists(st.integers(0, most), min_size=n, max_size=n))) if width > 2 else ()
-    packet = ydlidar.Packet(n == 1, 7.5 if n == 1 else 0.0, 100, 2000, samples, intensities)
-    assert ydlidar.decode(ydlidar.encode(packet, width)) == packet
+    packet = ydlidar_wire.Packet(n == 1, 7.5 if n == 1 else 0.0, 100, 2000, samples, intensities)
+    assert ydlidar_wire.decode(ydlidar_wire.encode(packet, width)) == packet
 
 
 def test_ydlidar_clock_packets_between_scan_packets_are_no_damage() -> None:
@@ -31,7 +31,7 @@ def test_ydlidar_clock_packets_between_scan_packets_are_no_damage() -> None:
     packets, at = [], 0
     while at < len(stream.data):
         end = at + 10 + 2 * stream.data[at + 3]
-        packets.append(stream.data[at:end] + ydlidar.encode_clock(at))
+        packets.append(stream.data[at:end] + ydlidar_wire.encode_clock(at))
         at = end
     driver = YdLidar("g4")
     scans = decode(stream, b"".join(packets), chunk=200, driver=driver)
@@ -42,7 +42,7 @@ def test_ydlidar_clock_packets_between_scan_packets_are_no_damage() -> None:
 def test_a_ydlidar_packet_that_ran_backwards_is_refused() -> None:
     """Seen in a real X4 capture: a good checksum, and LSA 1.2 degrees before FSA."""
     stream = STREAMS["ydlidar-2B"](seconds=1.0)
-    backwards = ydlidar.encode(ydlidar.Packet(False, 0.0, round(223.34 * 64), round(222.17 * 64), (4000,) * 40))
+    backwards = ydlidar_wire.encode(ydlidar_wire.Packet(False, 0.0, round(223.34 * 64), round(222.17 * 64), (4000,) * 40))
     at = 12 + 6 * 90  # behind the start packet and six others
     driver = YdLidar("g4")
     scans = decode(stream, stream.data[: 4 * 1142 + at] + backwards + stream.data[4 * 1142 + at :], chunk=300, driver=driver)

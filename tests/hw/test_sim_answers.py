@@ -6,7 +6,7 @@ import struct
 
 import pytest
 
-from hw import create2, roboclaw, ydlidar
+from hw import create2, roboclaw, ydlidar_wire
 from hw.sim.bases_sim import Counting, RoboClawSim
 from hw.sim.create2_sim import Create2Sim
 from hw.sim.sight import Sight, Standing
@@ -78,7 +78,7 @@ def test_a_roboclaw_drops_half_a_command_and_one_with_a_wrong_sum() -> None:
     assert answer(board, roboclaw.write_command(0x80, 6, b"\x10")[:-1] + b"\0") == b""
 
 
-@pytest.mark.parametrize("question", [0x91, ydlidar.HEALTH])
+@pytest.mark.parametrize("question", [0x91, ydlidar_wire.HEALTH])
 def test_a_ydlidar_tells_its_health_by_the_old_command_and_the_new(question: int) -> None:
     lidar = YdlidarSim("x4", Sight(Standing(ROOM, POSE)))
-    assert answer(lidar, ydlidar.command(question)) == ydlidar.answer(ydlidar.HEALTH_TYPE, b"\0\0\0")
+    assert answer(lidar, ydlidar_wire.command(question)) == ydlidar_wire.answer(ydlidar_wire.HEALTH_TYPE, b"\0\0\0")
