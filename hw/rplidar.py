@@ -8,18 +8,16 @@ from __future__ import annotations
 
 import struct
 
-import numpy as np
-from numpy.typing import NDArray
-
-from hw import rplidar_hq
+from hw import rplidar_hq, rplidar_nodes
 from hw import rplidar_wire as wire
 from hw.driver import Ask, Drain, Pause, Reading, Script, Send, SetLines
 from hw.errors import DeviceError, DeviceSilent
 from hw.framing import Bytes, ByteWindow, FixedFrames
-from hw.rplidar_capsules import KINDS, CapsuleKind, frames_of, start_angles_q6
+from hw.rplidar_capsule_chain import CapsuleChain
+from hw.rplidar_capsules import KINDS, frames_of, start_angles_q6
 from hw.rplidar_nodes import NodeFinder
 from hw.scan_assembler import Beams
-from hw.spinning import STRICT_ABOVE, Floats, Ints, SpinningLidar, carried
+from hw.spinning import Floats, Ints, SpinningLidar
 
 BAUDS = (115200, 460800, 256000, 1000000)
 RANGE_MIN_M, RANGE_MAX_M = 0.05, 40.0
@@ -27,10 +25,6 @@ SERIES_RANGE_M = {1: 12.0, 2: 18.0, 3: 25.0, 4: 16.0, 5: 16.0, 6: 40.0, 7: 30.0,
 DEFAULT_PWM, DEFAULT_RPM = 660, 600
 MODES = {"standard": wire.NODE_TYPE, "express": wire.EXPRESS_TYPE, "dense": wire.DENSE_TYPE}
 MODES |= {"ultra": wire.ULTRA_TYPE, "ultradense": wire.ULTRA_DENSE_TYPE, "hq": wire.HQ_TYPE}
-CIRCLE_Q6 = 360 * 64
-MOST_HZ = 100.0  # a capsule that spans more of the circle than this speed allows is not one
-LOOSE_SPAN, STRICT_SPAN = 0.05, 0.015  # real capsules differ by 1 to 2 % (SERIAL.md 1.7); on a bad line some of them are given up
-NEW_SPEED_AFTER = 4  # so many strange spans in a row are a new speed
 
 
 class Rplidar(SpinningLidar):
@@ -51,6 +45,7 @@ class Rplidar(SpinningLidar):
         self._single: wire.Descriptor | None = None
         self._is_limited = False
         self._nodes = NodeFinder()
+        self._chain = CapsuleChain(self.counters)
         self._capsules: dict[int, FixedFrames] = {kind: frames_of(KINDS[kind]) for kind in KINDS}
         self._restart_stream()
 
@@ -67,9 +62,7 @@ class Rplidar(SpinningLidar):
 
     def _restart_stream(self) -> None:
         self._nodes.restart()
-        self._last_capsule: Bytes | None = None
-        self._last_gap, self._last_arrival_s = 0, 0.0
-        self._usual_span_q6, self._strange_spans = 0.0, 0
+        self._chain.restart()
         self._last_angle_q6 = 0
 
     def start(self) -> Script:
@@ -273,89 +266,14 @@ class Rplidar(SpinningLidar):
         return self._hold(frames, now_s, is_turn)
 
     def _beams(self, frames: Bytes, gaps: Ints, arrivals_s: Floats) -> Beams:
+        byte_s = 10.0 / self.baud
         if self.scan_type == wire.NODE_TYPE:
-            return self._node_beams(frames, gaps, arrivals_s)
+            return rplidar_nodes.beams(frames, gaps, arrivals_s - rplidar_nodes.NODE_BYTES * byte_s)
         if self.scan_type == wire.HQ_TYPE:
-            return self._hq_beams(frames, gaps, arrivals_s)
+            return rplidar_hq.beams(frames, gaps, arrivals_s - rplidar_hq.FRAME_BYTES * byte_s, self.period_s)
         assert self.scan_type is not None
-        return self._capsule_beams(KINDS[self.scan_type], frames, gaps, arrivals_s)
-
-    def _node_beams(self, nodes: Bytes, gaps: Ints, arrivals_s: Floats) -> Beams:
-        words = nodes.astype(np.int64)
-        turn_deg = (words[:, 1] >> 1 | words[:, 2] << 7) / 64.0
-        mm = (words[:, 3] | words[:, 4] << 8) / 4.0
-        return Beams(
-            turn_deg=turn_deg,
-            angles_rad=-np.radians(turn_deg),
-            ranges_m=np.where(mm == 0, np.nan, mm / 1e3),
-            stamps_s=arrivals_s - 50.0 / self.baud,
-            intensities=(words[:, 0] >> 2).astype(np.float64),
-            is_dirty=gaps > 0,
-        )
+        return self._chain.beams(KINDS[self.scan_type], frames, gaps, arrivals_s, byte_s, self.period_s)
 
     def _witnessed(self, data: Bytes, gaps: Ints, arrivals_s: Floats) -> tuple[Bytes, Ints, Floats]:
         """Nodes were chosen by how they follow; capsules are chosen by the one behind them, when they are decoded."""
         return data, gaps, arrivals_s
-
-    def _hq_beams(self, frames: Bytes, gaps: Ints, arrivals_s: Floats) -> Beams:
-        turn_deg, mm, quality = rplidar_hq.decode(frames)
-        n = rplidar_hq.BEAMS
-        span_deg = (turn_deg[:, -1] - turn_deg[:, 0]) % 360.0
-        sample_s = span_deg / 360.0 * self.period_s / (n - 1)
-        sent_s = rplidar_hq.FRAME_BYTES * 10.0 / self.baud
-        stamps_s = (arrivals_s - sent_s)[:, None] - sample_s[:, None] * np.arange(n - 1, -1, -1)
-        return Beams(
-            turn_deg=turn_deg.ravel(),
-            angles_rad=-np.radians(turn_deg).ravel(),
-            ranges_m=np.where(mm == 0, np.nan, mm / 1e3).ravel(),
-            stamps_s=stamps_s.ravel(),
-            intensities=quality.ravel(),
-            is_dirty=np.repeat(gaps > 0, n),
-        )
-
-    def _capsule_beams(self, kind: CapsuleKind, frames: Bytes, gaps: Ints, arrivals_s: Floats) -> Beams:
-        """Beams of all capsules whose follower is here; the last one waits for its own."""
-        if self._last_capsule is not None:
-            frames = np.concatenate([self._last_capsule, frames])
-            gaps = np.concatenate([[self._last_gap], gaps])
-            arrivals_s = np.concatenate([[self._last_arrival_s], arrivals_s])
-        self._last_capsule, self._last_gap, self._last_arrival_s = frames[-1:], int(gaps[-1]), float(arrivals_s[-1])
-        start_q6, is_first = start_angles_q6(kind, frames)
-        span_q6 = np.diff(start_q6) % CIRCLE_Q6
-        self._is_strict = float(np.mean(gaps > 0)) > STRICT_ABOVE
-        is_true = self._are_true(kind, span_q6, start_q6[:-1], (gaps[1:] == 0) & ~is_first[1:])
-        this, following = frames[:-1][is_true], frames[1:][is_true]
-        beams = kind.decode(this, following)
-        n = kind.samples
-        span_deg, start_deg = span_q6[is_true] / 64.0, start_q6[:-1][is_true] / 64.0
-        turn_deg = (start_deg[:, None] + span_deg[:, None] * (np.arange(n) / n)) % 360.0
-        sample_s = span_deg / 360.0 * self.period_s / n
-        sent_s = kind.length * 10.0 / self.baud
-        stamps_s = (arrivals_s[:-1][is_true] - sent_s)[:, None] - sample_s[:, None] * np.arange(n - 1, -1, -1)
-        dirty = carried((gaps[:-1] > 0) | ~is_true, is_true)
-        mm = beams.distance_mm
-        return Beams(
-            turn_deg=turn_deg.ravel(),
-            angles_rad=-np.radians(turn_deg - beams.offset_deg).ravel(),
-            ranges_m=np.where(mm == 0, np.nan, mm / 1e3).ravel(),
-            stamps_s=stamps_s.ravel(),
-            intensities=None if beams.quality is None else beams.quality.ravel(),
-            is_dirty=np.repeat(dirty, n),
-        )
-
-    def _are_true(self, kind: CapsuleKind, span_q6: Ints, start_q6: Ints, is_next: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Which capsules are followed by their own follower: no byte between, and the span the motor's speed makes."""
-        most_q6 = MOST_HZ * 360 * 64 * kind.samples * 500e-6  # no RPLIDAR takes longer than 500 us for a sample
-        can_be = is_next & (span_q6 > 0) & (span_q6 < min(most_q6, 180 * 64)) & (start_q6 < CIRCLE_Q6)
-        is_true = np.zeros_like(can_be)
-        tolerance = STRICT_SPAN if self._is_strict else LOOSE_SPAN
-        for k in np.flatnonzero(can_be).tolist():
-            change = abs(span_q6[k] - self._usual_span_q6)
-            is_true[k] = change <= tolerance * self._usual_span_q6 + 2
-            self._strange_spans = 0 if is_true[k] else self._strange_spans + 1
-            if is_true[k]:
-                self._usual_span_q6 += 0.2 * (span_q6[k] - self._usual_span_q6)
-            elif self._strange_spans >= NEW_SPEED_AFTER or not self._usual_span_q6:  # the motor was set to another speed
-                self._usual_span_q6, self._strange_spans = float(span_q6[k]), 0
-        self.counters.rejected += int(np.count_nonzero(can_be & ~is_true))
-        return is_true

@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hw.framing import Bytes, FixedFrames
+from hw.scan_assembler import Beams
+from hw.spinning import Floats, Ints
 
 FRAME_BYTES, BEAMS = 781, 96
 DEG_PER_COUNT = 90.0 / 16384.0
@@ -52,3 +54,19 @@ def decode(frames: Bytes) -> tuple[NDArray[np.float64], NDArray[np.float64], NDA
     """(M, 781) frames to clockwise degrees, millimetres (0: nothing) and quality, (M, 96) each."""
     beams = np.ascontiguousarray(frames[:, 9:-4]).view(_BEAM)
     return beams["angle"] * DEG_PER_COUNT, beams["distance"] / 4.0, beams["quality"].astype(np.float64)
+
+
+def beams(frames: Bytes, gaps: Ints, sent_s: Floats, period_s: float) -> Beams:
+    """What frames say, with the bytes skipped before each and the time at which each was begun to be sent."""
+    turn_deg, mm, quality = decode(frames)
+    span_deg = (turn_deg[:, -1] - turn_deg[:, 0]) % 360.0
+    sample_s = span_deg / 360.0 * period_s / (BEAMS - 1)
+    stamps_s = sent_s[:, None] - sample_s[:, None] * np.arange(BEAMS - 1, -1, -1)
+    return Beams(
+        turn_deg=turn_deg.ravel(),
+        angles_rad=-np.radians(turn_deg).ravel(),
+        ranges_m=np.where(mm == 0, np.nan, mm / 1e3).ravel(),
+        stamps_s=stamps_s.ravel(),
+        intensities=quality.ravel(),
+        is_dirty=np.repeat(gaps > 0, BEAMS),
+    )

@@ -15,7 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hw.framing import ByteWindow, Counters, Frames
+from hw.framing import Bytes, ByteWindow, Counters, Frames
+from hw.scan_assembler import Beams
+from hw.spinning import Floats, Ints
 
 NODE_BYTES = 5
 TRUSTED_RUN = 4  # nodes in a row that follow from one another: by chance one in 10^7
@@ -141,3 +143,18 @@ def _is_run(data: bytes | bytearray, at: int) -> bool:
             return False
         before_q6 = after_q6
     return True
+
+
+def beams(nodes: Bytes, gaps: Ints, sent_s: Floats) -> Beams:
+    """What nodes say, with the bytes skipped before each and the time at which each was begun to be sent."""
+    words = nodes.astype(np.int64)
+    turn_deg = (words[:, 1] >> 1 | words[:, 2] << 7) / 64.0
+    mm = (words[:, 3] | words[:, 4] << 8) / 4.0
+    return Beams(
+        turn_deg=turn_deg,
+        angles_rad=-np.radians(turn_deg),
+        ranges_m=np.where(mm == 0, np.nan, mm / 1e3),
+        stamps_s=sent_s,
+        intensities=(words[:, 0] >> 2).astype(np.float64),
+        is_dirty=gaps > 0,
+    )
