@@ -19,7 +19,7 @@ from protocol.geometry import SE2
 from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 _BESIDE = np.ones((3, 3), np.uint8)
-_SAMPLES = 40_000  # cells of the earlier grid that tell how much of it a witness knows
+_SAMPLES = 10_000  # cells of the earlier grid that tell how much of it a witness knows
 _PATCH_CELLS, _PATCH_STEP, _SEARCH_CELLS = 24, 12, 24  # pieces of a map, coarse enough that a dozen fit into a corridor
 _TURNS_DEG = (0.0, -5.0, 5.0, -10.0, 10.0, -15.0, 15.0)
 _ALIKE = 0.6  # correlation of a piece with the place where it is found again
@@ -62,13 +62,7 @@ def taken_back(earlier: OccupancyGrid, newer: OccupancyGrid) -> TakenBack:
 
 
 def witnessed(change: TakenBack, witness: OccupancyGrid, T_witness_map: SE2) -> Testimony:
-    """What one other map says of the change."""
-    step = max(1, math.isqrt(change.earlier.cells.size // _SAMPLES))
-    known = step * np.argwhere(change.earlier.cells[::step, ::step] != UNKNOWN)
-    held = witness.values_at(T_witness_map.apply(change.earlier.points_of(known)))
-    common = step**2 * int(np.count_nonzero(held != UNKNOWN))
-    if not common or not len(change.points_m):
-        return Testimony(0.0, 0.0)
+    """What one other map says of the change; how much it knows is the long part, and asked only of one that sees some of it."""
     points_m = T_witness_map.apply(change.points_m)
     there = witness.values_at(points_m)
     is_beside = _is_wall_beside(witness, points_m)
@@ -76,7 +70,15 @@ def witnessed(change: TakenBack, witness: OccupancyGrid, T_witness_map: SE2) -> 
     is_exactly = np.where(change.was_wall, there == OCCUPIED, there == FREE)
     plain = int(np.count_nonzero(is_as_before & ~change.is_near))
     near = int(np.count_nonzero(is_exactly))
-    return Testimony(plain / common, near / common)
+    common = _common_cells(change.earlier, witness, T_witness_map) if plain or near else 0
+    return Testimony(plain / common, near / common) if common else Testimony(0.0, 0.0)
+
+
+def _common_cells(earlier: OccupancyGrid, witness: OccupancyGrid, T_witness_map: SE2) -> int:
+    """About how many cells both know."""
+    step = max(1, math.isqrt(earlier.cells.size // _SAMPLES))
+    known = step * np.argwhere(earlier.cells[::step, ::step] != UNKNOWN)
+    return step**2 * int(np.count_nonzero(witness.values_at(T_witness_map.apply(earlier.points_of(known))) != UNKNOWN))
 
 
 def grown(earlier: OccupancyGrid, newer: OccupancyGrid) -> OccupancyGrid:

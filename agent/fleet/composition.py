@@ -149,7 +149,7 @@ class Composition:
         """Recipes that members of the group published, of maps that some member still holds."""
         peers = [self._ledger.peers[robot] for robot in sorted(group.T_root) if robot in self._ledger.peers]
         held = {peer.beat.global_digest for peer in peers if peer.beat is not None}
-        return [peer.meta for peer in peers if peer.meta is not None and peer.meta.id() in held]
+        return [peer.meta for peer in peers if peer.meta is not None and peer.meta_id in held]
 
     def awaits_meta(self, robot: str) -> bool:
         """Whether a peer of our group holds a global map whose frame we should know before we make our own.
@@ -159,8 +159,8 @@ class Composition:
         group, peer = self._ledger.group, self._ledger.peers.get(robot)
         if self.global_map is not None or group is None or robot not in group.T_root or peer is None or peer.beat is None:
             return False
-        told = {other.meta.id() for other in self._ledger.peers.values() if other.meta is not None}
-        return peer.beat.global_digest not in told | {NO_DIGEST}
+        asked = peer.beat.global_digest
+        return asked != NO_DIGEST and all(other.meta_id != asked for other in self._ledger.peers.values())
 
     # Composing.
 
@@ -175,13 +175,19 @@ class Composition:
                     missing.append((robot, b""))
         if self._waits_for_recipes(group, now_s):
             return missing
-        pause_s = max(self._ledger.options.compose_period_s, _FUSING_SHARE * self._fusing_took_s)
-        if now_s - self._composed_s >= pause_s:
+        if now_s - self._composed_s >= self._pause_s(group):
             self._composed_s = now_s
             recipe = self._recipe(group, {robot: version for robot, version in versions.items() if version is not None})
             if recipe is not None and recipe != self._made:
                 self._fuse(recipe, now_s)
         return missing
+
+    def _pause_s(self, group: Group) -> float:
+        """Who belongs to us is told soon; how the maps grow the less often the more we are, since each of us lays all of them."""
+        options, period_s = self._ledger.options, self._ledger.options.compose_period_s
+        if self._made is not None and {member.robot for member in self._made.members} == group.T_root.keys():
+            period_s = max(period_s, options.compose_s_a_member * len(group.T_root))
+        return max(period_s, _FUSING_SHARE * self._fusing_took_s)
 
     def _waits_for_recipes(self, group: Group, now_s: float) -> bool:
         """A newcomer first asks which frame the others share already; not for long."""

@@ -17,8 +17,8 @@ class FleetOptions:
     lost_after_s: float = 15.0  # network stalls of 10 s are normal and mean nothing
     announce_period_s: float = 2.0  # a growing map is published at most this often; beats carry its version
     announce_growth: float = 0.10  # and its features are sent again when it has grown by this share
-    pull_period_s: float = 2.0  # a growing map of one peer is pulled at most this often
     compose_period_s: float = 2.0  # the global map is composed at most this often
+    compose_s_a_member: float = 0.4  # and while nobody comes or goes at most this often: the work of a group of 20 is that of 5
     fetch_timeout_s: float = 40.0  # a runtime that never answers a Fetch is not waited for longer
     max_bulk_fetches: int = 2  # more only share the same radio
     max_small_fetches: int = 8
