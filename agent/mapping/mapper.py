@@ -27,7 +27,7 @@ from agent.mapping.options import MappingOptions
 from agent.mapping.relocalization import Relocalization
 from agent.mapping.scan_matching import UNCONSTRAINED_RATIO
 from agent.mapping.scan_points import ScanPoints, laser_position_m, reference_stamp_s, scan_points
-from agent.mapping.tracking import GOOD_FRACTION, Tracked
+from agent.mapping.tracking import GOOD_FRACTION, SURE_FRACTION, Tracked
 from hw.readings import LaserScan, Odometry
 from protocol.grid import OccupancyGrid
 
@@ -107,7 +107,10 @@ class Mapper:
         return replace(self._outcome(status, is_keyframe, tracked.fraction), loop=loop)
 
     def _is_believable(self, points: ScanPoints, tracked: Tracked) -> bool:
-        """A good fit always; a poor one when wheels vouch for the pose and the map does not rule the scan out."""
+        """A good fit where the robot can be, a very good one where its wheels say it cannot (they slip, but a LIDAR that tilts
+        over a door sill fits anywhere); a poor one when wheels vouch for it and the map does not rule the scan out."""
+        if tracked.is_jump and self.contradictions < LOST_AFTER - 1:
+            return tracked.fraction >= SURE_FRACTION
         if tracked.fraction >= GOOD_FRACTION:
             return True
         return bool(self.odometry.stamps_s) and self._contradiction(points, tracked) <= CONTRADICTED

@@ -16,7 +16,8 @@ from agent.mapping.correlation import CoarseField
 from agent.mapping.likelihood import TiledFields
 from agent.mapping.scan_matching import Poses, difference, information, refine, weakest_direction
 
-GOOD_FRACTION = 0.55  # mean field value of a match that needs no second look
+SURE_FRACTION = 0.75  # mean field value of a match that needs no second look: a wheel that slipped by 9 degrees left 0.64
+GOOD_FRACTION = 0.55  # ... and of one that is believed, unless the wheels say that it cannot be
 SMALL_STEP_M = 0.15  # below this, odometry lies in the basin of Gauss-Newton
 SMALL_STEP_RAD = math.radians(5)
 NEAR_REACH = (0.3, math.radians(12))  # search window after a large step
@@ -35,6 +36,7 @@ class Tracked:
     likelihood: NDArray[np.float32]  # (M,) field value under every point
     curvature: NDArray[np.float64]  # (3, 3) of the walls alone
     weakest: float  # ratio of weakest to strongest direction
+    is_jump: bool  # farther from where the wheels say than they can be wrong, unless they slipped
 
 
 def track(
@@ -53,8 +55,8 @@ def track(
     starts = predicted[None]
     best = best_fit(fields, particle, starts, predicted, weights, surfels)
     is_small = step[0] < SMALL_STEP_M and step[1] < SMALL_STEP_RAD
-    for reach in (NEAR_REACH, WIDE_REACH):
-        if best.fraction >= GOOD_FRACTION and (is_small or reach is WIDE_REACH):
+    for reach, enough in ((NEAR_REACH, SURE_FRACTION if is_small else 1.0), (WIDE_REACH, GOOD_FRACTION)):
+        if best.fraction >= enough:
             break
         starts, _ = coarse.best_poses(predicted, surfels[:, :2], *reach, STARTS)
         best = better(best, best_fit(fields, particle, starts, predicted, weights, surfels))
@@ -77,13 +79,22 @@ def best_fit(
     n = len(starts)
     priors = np.broadcast_to(predicted, (n, 3))
     fit = refine(fields, np.full(n, particle), starts, priors, np.broadcast_to(weights, (n, 3, 3)), surfels)
-    scores = fit.likelihood.sum(axis=1, dtype=np.float64) - objections(fit.poses, predicted, weights)
+    objections = objected(fit.poses, predicted, weights)
+    scores = fit.likelihood.sum(axis=1, dtype=np.float64) - np.minimum(objections, LARGEST_OBJECTION)
     i = int(np.argmax(scores))
     ratio, _ = weakest_direction(fit.curvature[i])
-    return Tracked(fit.poses[i], float(scores[i]), float(fit.fractions()[i]), fit.likelihood[i], fit.curvature[i], ratio)
+    return Tracked(
+        pose=fit.poses[i],
+        score=float(scores[i]),
+        fraction=float(fit.fractions()[i]),
+        likelihood=fit.likelihood[i],
+        curvature=fit.curvature[i],
+        weakest=ratio,
+        is_jump=bool(objections[i] > LARGEST_OBJECTION),
+    )
 
 
-def objections(poses: Poses, predicted: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+def objected(poses: Poses, predicted: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
     """(P,) what odometry holds against each pose, in points that must fit to outweigh it."""
     d = difference(poses, np.broadcast_to(predicted, poses.shape))
-    return np.asarray(np.minimum(0.5 * np.einsum("pi,ij,pj->p", d, weights, d), LARGEST_OBJECTION))
+    return np.asarray(0.5 * np.einsum("pi,ij,pj->p", d, weights, d))

@@ -100,6 +100,32 @@ def test_slipping_wheels_do_not_move_the_map(drive: Drive) -> None:
     assert drive.error_m() < 0.06
 
 
+@pytest.mark.parametrize("turned_deg", [9, -11])
+def test_a_turn_that_the_wheels_did_not_tell_is_seen_at_once(drive: Drive, turned_deg: float) -> None:
+    drive.steps(100)
+    (now_s, before), turned = drive.path[100], SE2(0.0, 0.0, math.radians(turned_deg))
+    drive.path[100:] = [(now_s + 0.2 * k, before @ turned) for k in range(40)]
+    drive.wheels.last = before @ turned
+    for outcome in drive.steps(40):
+        error = outcome.T_map_robot.inverse() @ drive.path[0][1].inverse() @ before @ turned
+        assert abs(math.degrees(error.theta_rad)) < 2
+
+
+@pytest.mark.parametrize("floor_m", [0.8, 1.0, 1.5])
+def test_a_lidar_that_tilts_for_a_moment_and_sees_the_floor_does_not_move_the_robot(drive: Drive, floor_m: float) -> None:
+    drive.steps(100)
+    here = drive.after.T_map_robot
+    for _ in range(2):
+        drive.mapper.add_odometry(drive.odometry())
+        level = drive.scan()
+        floor_at_m = floor_m / np.maximum(np.cos(level.angles_rad), 0.05)
+        tilted = replace(level, ranges_m=np.minimum(level.ranges_m, floor_at_m).astype(np.float32))
+        assert drive.mapper.add_scan(tilted).T_map_robot.distance_m(here) < 0.3
+        drive.at += 1
+    drive.steps(10)
+    assert drive.error_m() < 0.06
+
+
 def test_without_odometry_close_scans_still_make_a_map() -> None:
     mapper = Mapper(OPTIONS, seed=0)
     rng, path = np.random.default_rng(2), rounds(30.0, hz=10.0)
