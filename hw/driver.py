@@ -1,7 +1,7 @@
 """What every device driver is: bytes in, readings out, and a script of how to start it.
 
-A driver does no I/O and knows no clock.  How a device is woken is a *script*: a generator of steps that the supervisor in
-`device.py` carries out, so that it reads from top to bottom like the manual:
+A driver does no I/O and knows no clock.  How a device is woken is a *script*: a generator of steps that
+`script_player.py` carries out, so that it reads from top to bottom like the manual:
 
     def start(self) -> Script:
         yield Send(STOP)

@@ -19,21 +19,21 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from hw.driver import Ask, Drain, Driver, Pause, Reading, Script, Send, SetBaud, SetLines
+from hw.driver import Driver, Reading, Script
 from hw.errors import DeviceAbsent, DeviceError, DeviceGarbled, DeviceSilent
 from hw.health import DeviceHealth, DeviceState, RateMeter, StreamJudge
+from hw.newest_readings import NewestReadings
 from hw.port import Port
-from hw.readings import LaserScan, Odometry
+from hw.readings import LaserScan
+from hw.script_player import READ_WAIT_S, play, play_out
 
 FIRST_BACK_OFF_S, LAST_BACK_OFF_S = 0.05, 2.0  # a replugged cable is back within a second; a missing one costs nothing
 SILENT_BACK_OFF_S = 0.4  # the port is there, the device says nothing: it may speak again any moment
-READ_WAIT_S = 0.05
 MIN_STALL_S, STALL_PERIODS = 0.3, 3.0  # HARDWARE.md: noticed within half a second
 PROBE_S = 0.6  # how long a rate is listened to before the next one is tried
 PROBE_BYTES = 4096  # no valid frame among so many: the rate or the device is another one
 FIRST_READING_S = 5.0  # a motor needs 1-2 s to spin up
 TRY_OTHERS_EVERY = 5  # a device that once answered at a rate is sought at the others only now and then
-SCAN_SLOTS, ODOMETRY_SLOTS = 2, 512  # newest wins: an old scan is worth nothing, old odometry is cheap
 
 
 OpenPort = Callable[[int, bool | None], Port]  # (baud, level of DTR while opening)
@@ -55,7 +55,7 @@ class Device:
         self._rng = rng or random.Random()
         self.tap: Callable[[float, bytes], None] | None = None  # sees every byte that is fed, with its time: the recorder
         self._is_passive = is_passive  # a recording: it speaks, and hears nothing
-        self._readings: deque[Reading] = deque()
+        self._readings = NewestReadings()
         self._arrived = threading.Condition()
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
@@ -99,8 +99,8 @@ class Device:
     def read(self, timeout_s: float) -> Reading | None:
         """The oldest reading not yet fetched, waiting up to `timeout_s`; None when there is none."""
         with self._arrived:
-            self._arrived.wait_for(lambda: bool(self._readings) or self._stopping.is_set(), timeout_s)
-            return self._readings.popleft() if self._readings else None
+            self._arrived.wait_for(lambda: len(self._readings) > 0 or self._stopping.is_set(), timeout_s)
+            return self._readings.pop()
 
     def health(self) -> DeviceHealth:
         """How the device is doing now."""
@@ -175,7 +175,7 @@ class Device:
             self._stream()
         finally:
             if not self._is_gone and not self._is_passive:
-                self._quietly(driver.stop())
+                play_out(driver.stop(), self._port)
 
     def _bring_up(self, port: Port) -> None:
         """Try each rate until the device answers its start script and sends a first good frame."""
@@ -191,7 +191,7 @@ class Device:
             self._driver.restart()
             try:
                 frames = self._driver.counters.frames
-                self._perform(self._driver.start())
+                self._play(self._driver.start())
                 self._first_frame(frames, PROBE_S if len(bauds) > 1 else FIRST_READING_S)
             except (DeviceSilent, DeviceGarbled) as error:
                 problems.append(error)
@@ -263,7 +263,7 @@ class Device:
         if restarts > 0:
             raise DeviceSilent(message)
         self._driver.restart()
-        self._perform(self._driver.start())
+        self._play(self._driver.start())
 
     def _judge(self, judge: StreamJudge, now_s: float) -> None:
         state = judge.state(now_s, self._health.coverage)
@@ -271,54 +271,11 @@ class Device:
         if state is not self._health.state or (error and error != self._health.last_error):
             self._note(state=state, last_error=error or self._health.last_error)
 
-    def _perform(self, script: Script) -> None:
-        """Carry out a driver's script, step by step."""
-        if self._is_passive:
-            return
-        answer: Any = None
-        while not self._stopping.is_set():
-            try:
-                step = script.send(answer)
-            except StopIteration:
-                return
-            answer = None
+    def _play(self, script: Script) -> None:
+        """Carry out a driver's script; a recording hears nothing."""
+        if not self._is_passive:
             assert self._port is not None
-            if isinstance(step, Send):
-                self._port.write(step.data)
-            elif isinstance(step, Ask):
-                answer = self._ask(step)
-            elif isinstance(step, Drain):
-                answer = self._drain(step)
-            elif isinstance(step, Pause):
-                self._pump_for(step.seconds)
-            elif isinstance(step, SetLines):
-                self._port.set_lines(step.dtr, step.rts)
-            elif isinstance(step, SetBaud):
-                self._set_baud(step.baud)
-
-    def _ask(self, step: Ask) -> object:
-        assert self._port is not None
-        self._port.write(step.data)
-        deadline_s = time.monotonic() + step.timeout_s
-        while (answer := step.until()) is None and not self._stopping.is_set():
-            left_s = deadline_s - time.monotonic()
-            if left_s <= 0:
-                return None
-            self._pump(min(left_s, READ_WAIT_S))
-        return answer
-
-    def _drain(self, step: Drain) -> bool:
-        assert self._port is not None
-        deadline_s = time.monotonic() + step.max_s
-        while time.monotonic() < deadline_s and not self._stopping.is_set():
-            if not self._port.read(step.quiet_s):
-                return True
-        return False
-
-    def _pump_for(self, seconds: float) -> None:
-        deadline_s = time.monotonic() + seconds
-        while (left_s := deadline_s - time.monotonic()) > 0 and not self._stopping.is_set():
-            self._pump(min(left_s, READ_WAIT_S))
+            play(script, self._port, self._pump, self._set_baud, self._stopping)
 
     def _pump(self, wait_s: float) -> int:
         """Move what has come to the driver and its readings to the reader; how many readings there were."""
@@ -343,15 +300,8 @@ class Device:
         return len(readings)
 
     def _hand_on(self, reading: Reading, now_s: float) -> None:
-        slots = SCAN_SLOTS if isinstance(reading, LaserScan) else ODOMETRY_SLOTS
-        dropped = 0
         with self._arrived:
-            while len(self._readings) >= slots:
-                oldest = self._readings.popleft()
-                dropped += 1
-                if isinstance(oldest, Odometry) and oldest.is_discontinuity:
-                    self._keep_discontinuity(reading)
-            self._readings.append(reading)
+            dropped = self._readings.push(reading)
             self._stamps.append(now_s)
             self._last_reading_s = now_s
             self._health = replace(self._health, readings=self._health.readings + 1, dropped=self._health.dropped + dropped)
@@ -361,31 +311,11 @@ class Device:
                 )
             self._arrived.notify_all()
 
-    def _keep_discontinuity(self, newest: Reading) -> None:
-        """A discontinuity that nobody fetched moves on to the next sample: it must not be lost."""
-        if self._readings and isinstance(self._readings[0], Odometry):
-            self._readings[0] = replace(self._readings[0], is_discontinuity=True)
-
     def _set_baud(self, baud: int) -> None:
         assert self._port is not None
         self._port.set_baud(baud)
         self._driver.set_baud(baud)
         self._note(baud=baud)
-
-    def _quietly(self, script: Script) -> None:
-        """Send what stops the device, without listening: used when leaving, so it must not take long or fail."""
-        try:
-            for step in script:
-                if self._port is None:
-                    return
-                if isinstance(step, Send | Ask):
-                    self._port.write(step.data)
-                elif isinstance(step, SetLines):
-                    self._port.set_lines(step.dtr, step.rts)
-                elif isinstance(step, Pause):
-                    time.sleep(min(step.seconds, 0.05))
-        except DeviceError:
-            return
 
     def _close(self) -> None:
         port, self._port = self._port, None
