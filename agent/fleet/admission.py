@@ -71,7 +71,6 @@ class Admission:
         is_denied = len(against) >= 2 and change.share_of_walls >= options.denied_walls
         if is_denied and share_found_again(change.earlier, peer.grid) < options.found_again:
             self._pairs.words.strike(peer, "map denies itself", now_s)
-            self._ledger.lay_out(now_s)
         return against
 
     def _witnesses(self, peer: Peer) -> list[tuple[str, OccupancyGrid, SE2]]:

@@ -149,7 +149,7 @@ class Composition:
         """Recipes that members of the group published, of maps that some member still holds."""
         peers = [self._ledger.peers[robot] for robot in sorted(group.T_root) if robot in self._ledger.peers]
         held = {peer.beat.global_digest for peer in peers if peer.beat is not None}
-        return [peer.meta for peer in peers if peer.meta is not None and peer.meta.id() in held]
+        return [peer.meta for peer in peers if peer.meta is not None and peer.meta_id in held]
 
     def awaits_meta(self, robot: str) -> bool:
         """Whether a peer of our group holds a global map whose frame we should know before we make our own.
@@ -159,8 +159,8 @@ class Composition:
         group, peer = self._ledger.group, self._ledger.peers.get(robot)
         if self.global_map is not None or group is None or robot not in group.T_root or peer is None or peer.beat is None:
             return False
-        told = {other.meta.id() for other in self._ledger.peers.values() if other.meta is not None}
-        return peer.beat.global_digest not in told | {NO_DIGEST}
+        asked = peer.beat.global_digest
+        return asked != NO_DIGEST and all(other.meta_id != asked for other in self._ledger.peers.values())
 
     # Composing.
 

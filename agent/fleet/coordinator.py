@@ -128,7 +128,6 @@ class Coordinator:
         now_s = self._ledger.clock.at(now_s)
         self._pairs.on_done(job, result, now_s)
         self._ledger.judge_pair(self.robot, job.peer, now_s)
-        self._ledger.lay_out(now_s)
         self._ledger.timetable.next_scan_s = now_s
         return self._done()
 
@@ -183,7 +182,6 @@ class Coordinator:
             self._pairs.words.withdraw(peer, "unmerged by the operator", now_s)
             self._ledger.judge_all(peer, now_s)
             self._ledger.note("unmerged", peer=peer)
-            self._ledger.lay_out(now_s)
             self._ledger.timetable.next_scan_s = now_s
         return self._done()
 
@@ -196,7 +194,6 @@ class Coordinator:
             known.trust.pardon()
             self._pairs.pairs.pop(peer, None)
             self._ledger.judge_all(peer, now_s)
-            self._ledger.lay_out(now_s)
         return self._done()
 
     def memory(self) -> FleetMemory:

@@ -11,7 +11,7 @@ import functools
 import math
 import random
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -66,7 +66,7 @@ def _solve(edges: tuple[Edge, ...]) -> Layout:
     pending = _components(edges)
     while pending:
         component = pending.pop()
-        kept, frames, covariance = _fit(component)
+        kept, frames, covariance = _fit(tuple(component))
         if len(kept) < len(component):
             kept_ids = {edge.id for edge in kept}
             rejected += [edge for edge in component if edge.id not in kept_ids]
@@ -95,7 +95,8 @@ def _components(edges: tuple[Edge, ...]) -> list[list[Edge]]:
     return list(by_leader.values())
 
 
-def _fit(edges: list[Edge]) -> tuple[list[Edge], dict[str, SE2], dict[str, Symmetric3]]:
+@functools.lru_cache(maxsize=256)  # an edge changes one group; the others stay as they are
+def _fit(edges: tuple[Edge, ...]) -> tuple[Sequence[Edge], Mapping[str, SE2], Mapping[str, Symmetric3]]:
     """Lay out one component: the edges that fit, the frames, their covariance."""
     names = sorted({edge.a for edge in edges} | {edge.b for edge in edges})
     votes = _consensus(edges)
@@ -115,7 +116,7 @@ def _fit(edges: list[Edge]) -> tuple[list[Edge], dict[str, SE2], dict[str, Symme
     return edges, fitted, covariances(names, edges, fitted)
 
 
-def _consensus(edges: list[Edge]) -> dict[bytes, tuple[int, int]]:
+def _consensus(edges: Sequence[Edge]) -> dict[bytes, tuple[int, int]]:
     """For every edge: (two-hop detours that contradict it, negated; that agree with it)."""
     hops: dict[str, dict[str, SE2]] = defaultdict(dict)
     for edge in edges:
@@ -131,7 +132,7 @@ def _consensus(edges: list[Edge]) -> dict[bytes, tuple[int, int]]:
     return votes
 
 
-def _layouts(names: list[str], edges: list[Edge], votes: Mapping[bytes, tuple[int, int]]) -> Iterator[Problem]:
+def _layouts(names: list[str], edges: Sequence[Edge], votes: Mapping[bytes, tuple[int, int]]) -> Iterator[Problem]:
     """Layouts along different spanning trees, the most trusted first: in a small group one wrong branch spoils all."""
     ranked = sorted(edges, key=lambda edge: (votes[edge.id], edge.trust, edge.id), reverse=True)
     yield Problem(names, edges, _tree_layout(names, ranked))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,7 +33,7 @@ class Edge:
 class Problem(PoseGraph):
     """The frames of one component; the first stays at identity."""
 
-    def __init__(self, names: list[str], edges: list[Edge], frames: Mapping[str, SE2]) -> None:
+    def __init__(self, names: list[str], edges: Sequence[Edge], frames: Mapping[str, SE2]) -> None:
         index = {name: i for i, name in enumerate(names)}
         self.names = names
         super().__init__(
@@ -59,7 +59,7 @@ def _information(covariance: Symmetric3) -> NDArray[np.float64]:
     return np.linalg.inv(full + np.diag([_SIGMA_M**2, _SIGMA_M**2, _SIGMA_RAD**2]))
 
 
-def covariances(names: list[str], edges: list[Edge], frames: Mapping[str, SE2]) -> dict[str, Symmetric3]:
+def covariances(names: list[str], edges: Sequence[Edge], frames: Mapping[str, SE2]) -> dict[str, Symmetric3]:
     """Marginal covariance of every frame, the first at zero; in large groups only the diagonal is worth its price."""
     n = len(names)
     if n > DENSE_NODES:

@@ -49,7 +49,7 @@ class Inbox:
             case Statement():
                 self._on_statement(peer, message, now_s)
             case GlobalMeta() if peer.meta is None or message.seq > peer.meta.seq:
-                peer.meta, peer.meta_s = message, now_s
+                peer.hear_meta(message, now_s)
             case _:
                 pass
 
@@ -61,7 +61,7 @@ class Inbox:
             case Statements():
                 self._on_statements(peer, message, now_s)
             case GlobalMeta() if peer.meta is None or message.seq >= peer.meta.seq:
-                peer.meta, peer.meta_s = message, now_s
+                peer.hear_meta(message, now_s)
             case CoarseMap():
                 peer.coarse = message
             case FineTiles():
@@ -111,7 +111,6 @@ class Inbox:
             self._pairs.words.on_said(peer, now_s)
             self._ledger.judge_pair(self._ledger.robot, peer.robot, now_s)
             self._ledger.timetable.next_scan_s = now_s
-        self._ledger.lay_out(now_s)
 
     def _on_fine(self, peer: Peer, said: FineTiles, now_s: float) -> None:
         """Cells, as a difference to some we hold or to nothing; their digest proves them."""
@@ -161,6 +160,4 @@ class Inbox:
         for robot in roster.twins:
             if self._ledger.count(f"twins of {robot}") == 1:
                 self._ledger.note("twin", is_warning=True, peer=robot)
-        if roster.restarted:
-            self._ledger.lay_out(now_s)
         roster.joined, roster.restarted, roster.twins = [], [], []

@@ -31,8 +31,9 @@ class Ledger:
         self.mine: dict[str, Statement] = {}  # our statements, by the other robot
         self.seq = 0
         self.live: dict[PairKey, Evidence] = {}
-        self.layout = Layout()
-        self.is_layout_old = False
+        self._edges: dict[PairKey, Edge] = {}  # of `live`
+        self._layout = Layout()
+        self._is_layout_old = False
         self.effects: list[Effect] = []
         self.clock, self.timetable = Clock(), Timetable()
         self.counts: dict[str, int] = {}
@@ -41,6 +42,14 @@ class Ledger:
     @property
     def peers(self) -> dict[str, Peer]:
         return self.roster.peers
+
+    @property
+    def layout(self) -> Layout:
+        """The frames of all groups, solved when they are asked for: statements come in crowds."""
+        if self._is_layout_old:
+            self._is_layout_old = False
+            self._solve()
+        return self._layout
 
     @property
     def group(self) -> Group | None:
@@ -105,13 +114,15 @@ class Ledger:
         if evidence == self.live.get(key):
             return
         if evidence is None:
-            del self.live[key]
+            del self.live[key], self._edges[key]
         else:
             if self.robot in key and key not in self.live:
                 T = evidence.T_a_b
                 self.note("merged", a=key[0], b=key[1], match_factor=evidence.match_factor, T_a_b=(T.x_m, T.y_m, T.theta_rad))
-            self.live[key] = evidence
-        self.is_layout_old = True
+            self.live[key], e = evidence, evidence
+            self._edges[key] = Edge(e.robot_a, e.robot_b, e.T_a_b, e.covariance, e.overlap_m2 * e.match_factor, e.id())
+        self._is_layout_old = True
+        self.timetable.next_scan_s = now_s
 
     def judge_all(self, robot: str, now_s: float) -> None:
         """Look again at every edge of one robot."""
@@ -122,22 +133,13 @@ class Ledger:
         for other in others:
             self.judge_pair(robot, other, now_s)
 
-    def lay_out(self, now_s: float) -> None:
-        """Solve the frames anew when an edge was born or died, and name the edges that came to contradict the others."""
-        if not self.is_layout_old:
-            return
-        self.is_layout_old = False
-        before = self.layout
-        self.layout = solve(
-            Edge(e.robot_a, e.robot_b, e.T_a_b, e.covariance, e.overlap_m2 * e.match_factor, e.id()) for e in self.live.values()
-        )
-        if self.layout is before:
-            return
-        known = {edge.id for edge in before.rejected}
-        for edge in self.layout.rejected:
+    def _solve(self) -> None:
+        """Solve the frames anew, and name the edges that came to contradict the others."""
+        known = {edge.id for edge in self._layout.rejected}
+        self._layout = solve(self._edges.values())
+        for edge in self._layout.rejected:
             if edge.id not in known:
                 self.note("edge-contradicts-loops", is_warning=True, a=edge.a, b=edge.b)
-        self.timetable.next_scan_s = now_s
 
     def count(self, what: str) -> int:
         """One more of these; for status pages, bounded."""

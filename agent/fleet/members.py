@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass, field
 
@@ -11,7 +12,18 @@ from agent.fleet.state import Presence
 from agent.fleet.trust import Trust
 from protocol.geometry import SE2
 from protocol.grid import OccupancyGrid
-from protocol.messages import Beat, CoarseMap, GlobalMeta, Hello, MapAnnouncement, MapVersion, Message, Statement, Statements
+from protocol.messages import (
+    NO_DIGEST,
+    Beat,
+    CoarseMap,
+    GlobalMeta,
+    Hello,
+    MapAnnouncement,
+    MapVersion,
+    Message,
+    Statement,
+    Statements,
+)
 
 _RETIRED_BOOTS = 4
 _KEPT_PEER_MAPS = 6
@@ -41,6 +53,7 @@ class Peer:
     announcement: MapAnnouncement | None = None
     coarse: CoarseMap | None = None
     meta: GlobalMeta | None = None
+    meta_id: bytes = NO_DIGEST  # of `meta`
     meta_s: float = -1e18  # when it was heard; older beats may speak of an earlier one
     statements: dict[str, Statement] = field(default_factory=dict)
     statements_seq: int = 0
@@ -102,9 +115,13 @@ class Peer:
         alive = set(self.maps.digests())
         self.versions = {digest: kept for digest, kept in self.versions.items() if digest in alive}
 
+    def hear_meta(self, meta: GlobalMeta, now_s: float) -> None:
+        self.meta, self.meta_id, self.meta_s = meta, meta.id(), now_s
+
     def forget_words(self) -> None:
         """A new life: what the old one said is void; its cells stay, they belong to their frame."""
         self.hello = self.beat = self.announcement = self.coarse = self.meta = None
+        self.meta_id = NO_DIGEST
         self.statements, self.statements_seq, self.statements_digest = {}, 0, None
 
 
@@ -118,6 +135,7 @@ class Roster:
         self.joined: list[str] = []
         self.unmerged: set[str] = set()  # by the operator, in a life before
         self.twins: list[str] = []  # robots of which two lives speak at once
+        self._look_s = -1e18  # nobody's presence changes before
 
     def hear(self, message: Message, now_s: float) -> Peer | None:
         """The peer this message may change; None when it is from a life that is over, or the table is full."""
@@ -128,6 +146,7 @@ class Roster:
             peer = self.peers[message.robot] = Peer(message.robot, message.boot, now_s, now_s)
             peer.is_unmerged = message.robot in self.unmerged
             self.joined.append(peer.robot)
+            self._look_s = min(self._look_s, self._next_change_s(peer))
         if message.boot != peer.boot:
             if message.boot in peer.ghosts:
                 if not self._ghost_lives(peer, message, now_s):
@@ -136,7 +155,7 @@ class Roster:
                 return None  # a new life introduces itself first
             elif still_beats(peer, now_s):
                 return None  # a twin, perhaps: the life that is known is believed until it misses a beat
-            self._reborn(peer, message.boot)
+            self._reborn(peer, message.boot, now_s)
         peer.heard_s = now_s
         return peer
 
@@ -145,31 +164,45 @@ class Roster:
         if peer.beat is not None and beat.seq <= peer.beat.seq:
             return False
         peer.beat, peer.beat_s = beat, now_s
+        self._look_s = min(self._look_s, self._next_change_s(peer) if peer.presence is Presence.ALIVE else now_s)
         return True
 
     def update_presence(self, now_s: float) -> list[Peer]:
         """Judge silence; the peers whose presence changed."""
+        if now_s < self._look_s:
+            return []
         changed = []
         for peer in self.peers.values():
             presence = self._presence(peer, now_s)
             if presence is not peer.presence:
                 peer.presence = presence
                 changed.append(peer)
+        self._look_s = min(map(self._next_change_s, self.peers.values()), default=now_s)
         return changed
 
     def _presence(self, peer: Peer, now_s: float) -> Presence:
         silent_s = now_s - peer.beat_s
-        if silent_s > max(self._options.lost_after_s, 5.0 * peer.period_s):
+        if silent_s > self._lost_after_s(peer):
             return Presence.LOST
         return Presence.SUSPECT if silent_s > self._options.suspect_after_beats * peer.period_s else Presence.ALIVE
 
-    def _reborn(self, peer: Peer, boot: int) -> None:
+    def _lost_after_s(self, peer: Peer) -> float:
+        return max(self._options.lost_after_s, 5.0 * peer.period_s)
+
+    def _next_change_s(self, peer: Peer) -> float:
+        """The earliest moment at which this peer may be judged otherwise, unless it speaks; a beat may revive the silent."""
+        suspect_s = peer.beat_s + self._options.suspect_after_beats * peer.period_s
+        lost_s = peer.beat_s + self._lost_after_s(peer)
+        return {Presence.ALIVE: min(suspect_s, lost_s), Presence.SUSPECT: lost_s, Presence.LOST: math.inf}[peer.presence]
+
+    def _reborn(self, peer: Peer, boot: int, now_s: float) -> None:
         peer.ghosts.pop(boot, None)
         peer.ghosts[peer.boot] = Ghost(peer.beat.seq if peer.beat else 0)
         while len(peer.ghosts) > _RETIRED_BOOTS:
             del peer.ghosts[next(iter(peer.ghosts))]
         peer.boot = boot
         peer.forget_words()
+        self._look_s = now_s
         self.restarted.append(peer.robot)
 
     def _ghost_lives(self, peer: Peer, message: Message, now_s: float) -> bool:

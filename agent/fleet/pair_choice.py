@@ -84,10 +84,9 @@ class PairChoice:
         """A pair of our own group without an edge: one more edge makes one more loop to check the others by."""
         group = self._ledger.group
         assert group is not None
-        edges = sum(self._ledger.robot in key for key in self._ledger.live)
-        if not peer.is_in_frame or edges >= self._ledger.options.max_edges:
+        if not peer.is_in_frame or not self._is_due(pair.loop, self.area_m2(peer), peer.held, now_s):
             return None
-        if not self._is_due(pair.loop, self.area_m2(peer), peer.held, now_s):
+        if sum(self._ledger.robot in key for key in self._ledger.live) >= self._ledger.options.max_edges:
             return None
         return Due(Purpose.LOOP, None, group.T_root[self._ledger.robot].inverse() @ group.T_root[peer.robot])
 

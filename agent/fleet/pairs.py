@@ -63,7 +63,6 @@ class PairWork:
         """A robot began its map anew: what was said about the old one is void."""
         self.words.drop_void(robot)
         self._ledger.judge_all(robot, now_s)
-        self._ledger.lay_out(now_s)
 
     def _is_of_today(self, running: Running, peer: Peer) -> bool:
         """Whether both maps are still drawn in the frames that were compared."""

@@ -33,9 +33,8 @@ class Pulling:
             peer.statements_digest = statements_digest(peer.statements.values())
         if peer.beat_s >= peer.said_s and beat.edges_digest != peer.statements_digest:
             self._fetching.want(peer.robot, "edges", "edges", now_s)
-        meta_id = peer.meta.id() if peer.meta else NO_DIGEST
         is_wanted = peer.robot == self._composition.composer or self._composition.awaits_meta(peer.robot)
-        if is_wanted and peer.beat_s >= peer.meta_s and beat.global_digest not in (NO_DIGEST, meta_id):
+        if is_wanted and peer.beat_s >= peer.meta_s and beat.global_digest not in (NO_DIGEST, peer.meta_id):
             self._fetching.want(peer.robot, "global", "global/meta", now_s)
 
     def pull_maps(self, turn: list[Peer], now_s: float) -> None:

@@ -1,16 +1,16 @@
 """What a fleet costs each robot as it grows, up to a thousand robots, in simulation.
 
-    .venv/bin/python -m tests.campaigns.fleet_scale [--sizes 2 5 10 30 100 300 1000] [--minutes 2] [--json FILE] [--svg FILE]
+    .venv/bin/python -m tests.campaigns.fleet_scale [--sizes 2 10 30 100 300 1000] [--json FILE] [--svg FILE]
 
-Robots stand on a grid of places 9 m apart and see 8 m around them, so each overlaps its neighbours; they run the real
-coordinators, and every byte is counted as it is encoded.  The first minute is the meeting, the last one the steady state.
+Five robots a building, in a row: each map overlaps those beside it, and no map of another building.  All hear all, as in a
+peer mesh without loss.  The coordinators and the codec are the real ones; matches are judged on the simulated cells; a
+message is encoded once and heard by everybody as one object.  Large fleets are simulated for a shorter time and tick less often.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 import time
 from dataclasses import asdict, dataclass
@@ -18,153 +18,208 @@ from pathlib import Path
 
 import numpy as np
 
-from agent.fleet.effects import Match, MatchKind
-from agent.fleet.options import FleetOptions
-from agent.merging.result import MatchStatus, MergeResult
+from agent.fleet.effects import Fetch, Match, MatchKind
+from agent.merging.result import MergeResult
+from protocol.codec import encode
 from protocol.features import FeatureMap
 from protocol.geometry import SE2
+from protocol.messages import Message
+from tests.bench.line_chart import log_log_chart
+from tests.bench.tables import markdown
 from tests.fleet.explorer import Explorer, judged, random_world
 from tests.fleet.simulation import Fleet, Node
 
-SPACING_M, RADIUS_M, CELL_M = 9.0, 8.0, 1.0
+ROBOTS_A_BUILDING, SPACING_M, RADIUS_M, CELL_M, SIDE_M = 5, 9.0, 8.0, 0.5, 60.0
+_WALLS_A_PLACE = 6  # two robots side by side share those between them
+_PICTURE = Path(__file__).resolve().parents[1] / "bench" / "pictures" / "fleet_scale.svg"
+
+
+@dataclass(frozen=True, slots=True)
+class Times:
+    """How long a fleet is simulated: while it meets, then in its steady state."""
+
+    meeting_s: float
+    steady_s: float
+    tick_s: float
+
+
+def times_of(robots: int) -> Times:
+    """A robot of a large fleet beats every robots / 40 seconds; the steady state is longer than that."""
+    if robots <= 30:
+        return Times(60.0, 60.0, 0.2)
+    if robots <= 100:
+        return Times(60.0, 60.0, 0.5)
+    return Times(30.0, 30.0, 1.0) if robots <= 300 else Times(30.0, 30.0, 2.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One size of fleet; per robot and minute."""
+    """One size of fleet; means over its robots."""
 
     robots: int
-    groups: int
-    largest_group: int
-    heard_messages: float  # steady state
+    meeting_s: float
+    steady_s: float
+    tick_s: float
+    meeting_heard_bytes: float  # in the whole meeting
+    meeting_pushed_bytes: float
+    meeting_pulled_bytes: float
+    merged_share: float  # of the robots, at the end: their global map holds their whole building
+    heard_messages: float  # a minute of the steady state, like all below
     heard_bytes: float
-    sent_bytes: float  # pushed once; the network copies it
-    pulled_bytes_first: float  # in the first minute
-    pulled_bytes: float  # in the last
-    cpu_ms: float  # of all coordinators and the simulated network, steady state
-    wall_s: float
+    pushed_messages: float  # handed to the network once, which copies it
+    pushed_bytes: float
+    pulled_messages: float
+    pulled_bytes: float
+    most_peers: int  # entries in the largest peer table
+    cpu_s: float  # the whole run: all robots, the network and the matcher
 
 
-def place_of(i: int, side: int) -> SE2:
-    offset = SPACING_M * (side - 1) / 2
-    return SE2(SPACING_M * (i % side) - offset, SPACING_M * (i // side) - offset, 0.3 * i)
+class Crowd(Fleet):
+    """A lossless mesh: a message is one event, whoever hears it."""
 
+    def __init__(self, robots: int, tick_s: float) -> None:
+        super().__init__(robots, judge=judge, is_encoded=False)
+        self.tick_s = tick_s
+        self._pulls = 0
 
-def features_of(place: SE2) -> FeatureMap:
-    """Walls whose lengths tell the neighbourhood, as real ones do."""
-    corners = [(round(place.x_m / SPACING_M) + dx, round(place.y_m / SPACING_M) + dy) for dx in (0, 1) for dy in (0, 1)]
-    lengths = [2.0 + 1.1 ** ((37 * x + 101 * y) % 60) for x, y in corners]
-    return FeatureMap(lines=np.array([[0, 0, 0, length, 0.01, 0.01] for length in lengths], np.float32))
+    def publish(self, node: Node, message: Message) -> None:
+        size = len(encode(message))
+        kind = type(message).__name__
+        node.sent[kind] += size
+        node.messages[kind] += 1
+        self.at(self.rng.uniform(*self.link.delay_s), lambda: self._spread(node, message, size))
+
+    def _spread(self, sender: Node, message: Message, size: int) -> None:
+        for node in self.nodes.values():
+            if node is not sender and node.coordinator is not None:
+                node.received_messages += 1
+                node.received_bytes += size
+                effects = node.coordinator.on_message(message, self.now_s)
+                if effects:
+                    self.carry_out(node, effects)
+
+    def _pull(self, node: Node, fetch: Fetch) -> Message | None:
+        answer = super()._pull(node, fetch)
+        self._pulls += answer is not None
+        return answer
+
+    def totals(self) -> dict[str, float]:
+        """Means over all robots, so far."""
+        nodes = list(self.nodes.values())
+        pulled_bytes = sum(node.pulled_bytes for node in nodes)
+        sums = {
+            "heard_messages": sum(node.received_messages for node in nodes),
+            "heard_bytes": sum(node.received_bytes for node in nodes),
+            "pushed_messages": sum(node.messages.total() for node in nodes) - self._pulls,
+            "pushed_bytes": sum(node.sent.total() for node in nodes) - pulled_bytes,
+            "pulled_messages": self._pulls,
+            "pulled_bytes": pulled_bytes,
+        }
+        return {name: value / len(nodes) for name, value in sums.items()}
 
 
 def judge(fleet: Fleet, node: Node, job: Match) -> MergeResult:
-    """The truth; robots far apart are told so without looking at cells."""
+    """The cells at the true transform, in one building; robots of two buildings share nothing."""
     here, there = node.explorer, fleet.nodes[job.peer].explorer
     assert here is not None and there is not None
-    if here.T_world_robot.distance_m(there.T_world_robot) > 2.0 * SPACING_M:
-        return MergeResult.none("far apart")
+    if here.world is not there.world:
+        return MergeResult.none("another building")
     T = job.T_ours_theirs if job.kind is MatchKind.VERIFY else fleet.true_T(node.robot, job.peer)
     assert T is not None
-    result = judged(job.ours, job.theirs, T)
-    return result if result.status is MatchStatus.MERGED else MergeResult.none("too little in common")
+    return judged(job.ours, job.theirs, T)
 
 
-def measure(robots: int, minutes: int) -> Row:
-    started_s = time.monotonic()
-    side = math.ceil(math.sqrt(robots))
-    size_m = SPACING_M * side + 4 * RADIUS_M
-    world = random_world(7, size_m, CELL_M, walls=int(size_m**2 / 50))
-    fleet = Fleet(robots, judge=judge, is_encoded=False)
-    fleet.tick_s = 0.2 if robots <= 100 else 1.0
-    options = FleetOptions()
+def robot_in(building: int, place: int, world_seed: int) -> Explorer:
+    """A robot that has looked around its place once."""
+    world = random_world(world_seed, SIDE_M, CELL_M, walls=int(SIDE_M**2 / 25))
+    pose = SE2(SPACING_M * (place - (ROBOTS_A_BUILDING - 1) / 2), 0.0, 0.3 * place)
+    explorer = Explorer.at(world, pose, 0.1 * building)
+    explorer.look(pose, RADIUS_M)
+    lengths_m = np.concatenate(
+        [np.random.default_rng((building, place + side)).uniform(1.0, 15.0, _WALLS_A_PLACE) for side in (0, 1)]
+    )
+    lines = np.zeros((len(lengths_m), 6), np.float32)
+    lines[:, 3], lines[:, 4:] = lengths_m, 0.01
+    explorer.features = FeatureMap(lines=lines)
+    return explorer
+
+
+def measure(robots: int) -> Row:
+    times, cpu_s = times_of(robots), time.process_time()
+    fleet = Crowd(robots, times.tick_s)
     for i in range(robots):
-        place = place_of(i, side)
-        explorer = Explorer.at(world, place, 0.1 * i)
-        explorer.look(place, RADIUS_M)
-        explorer.features = features_of(place)
-        fleet.add(f"r{i:04}", explorer, options)
-    nodes = list(fleet.nodes.values())
-    fleet.run(60.0)
-    pulled_first = sum(node.pulled_bytes for node in nodes)
-    fleet.run(60.0 * max(0, minutes - 2))
-    before = [(n.received_messages, n.received_bytes, sum(n.sent.values()), n.pulled_bytes) for n in nodes]
-    cpu_s = time.process_time()
-    fleet.run(60.0)
-    cpu_s = time.process_time() - cpu_s
-    after = [(n.received_messages, n.received_bytes, sum(n.sent.values()), n.pulled_bytes) for n in nodes]
-    heard, heard_bytes, sent, pulled = (np.array(after, float) - np.array(before, float)).mean(axis=0)
-    assert nodes[0].coordinator is not None
-    sizes: dict[str, int] = {}
-    for node in nodes:
-        assert node.coordinator is not None
-        group = node.coordinator._ledger.group
-        sizes[min(group.T_root) if group else node.robot] = len(group.T_root) if group else 1
+        building, place = divmod(i, ROBOTS_A_BUILDING)
+        fleet.add(f"r{i:04}", robot_in(building, place, 7 + building))
+    fleet.run(times.meeting_s)
+    met = fleet.totals()
+    fleet.run(times.steady_s)
+    steady = {name: (value - met[name]) * 60.0 / times.steady_s for name, value in fleet.totals().items()}
     return Row(
-        robots,
-        len(sizes),
-        max(sizes.values()),
-        float(heard),
-        float(heard_bytes),
-        float(sent - pulled),
-        pulled_first / robots,
-        float(pulled),
-        1000.0 * cpu_s / robots,
-        round(time.monotonic() - started_s, 1),
+        robots=robots,
+        meeting_s=times.meeting_s,
+        steady_s=times.steady_s,
+        tick_s=times.tick_s,
+        meeting_heard_bytes=met["heard_bytes"],
+        meeting_pushed_bytes=met["pushed_bytes"],
+        meeting_pulled_bytes=met["pulled_bytes"],
+        merged_share=merged_share(fleet),
+        most_peers=max(len(node.coordinator._ledger.peers) for node in fleet.nodes.values() if node.coordinator),
+        cpu_s=time.process_time() - cpu_s,
+        **steady,
     )
 
 
-def draw(rows: list[Row], file: Path) -> None:
-    """Bytes a minute over fleet size, both logarithmic, as a small SVG."""
-    low, high = 1.0, max(row.robots for row in rows)
+def merged_share(fleet: Fleet) -> float:
+    """Share of the robots whose global map holds everybody of their building."""
+    names = list(fleet.nodes)
+    merged = 0
+    for i, name in enumerate(names):
+        first = i - i % ROBOTS_A_BUILDING
+        held = fleet.nodes[name].global_map
+        merged += held is not None and {member.robot for member in held.members} == set(names[first : first + ROBOTS_A_BUILDING])
+    return merged / len(names)
 
-    def at(row: Row, value: float) -> str:
-        x = 60 + 520 * math.log10(row.robots / low) / math.log10(high / low)
-        return f"{x:.1f},{330 - 50 * math.log10(max(value, 1.0)):.1f}"
 
-    curves = {
-        "heard": "heard_bytes",
-        "pushed": "sent_bytes",
-        "pulled": "pulled_bytes",
-        "pulled, first minute": "pulled_bytes_first",
+def shown(row: Row) -> dict[str, object]:
+    """The line of the table."""
+    return {
+        "robots": row.robots,
+        "simulated s: meeting + steady (tick)": f"{row.meeting_s:.0f} + {row.steady_s:.0f} ({row.tick_s:g})",
+        "meeting, a robot: pushed / heard / pulled kB": " / ".join(
+            f"{size / 1e3:,.1f}" for size in (row.meeting_pushed_bytes, row.meeting_heard_bytes, row.meeting_pulled_bytes)
+        ),
+        "buildings whole": f"{100 * row.merged_share:.0f} %",
+        "a minute: pushed": f"{row.pushed_messages:,.1f} messages, {row.pushed_bytes:,.0f} B",
+        "heard": f"{row.heard_messages:,.0f} messages, {row.heard_bytes:,.0f} B",
+        "pulled": f"{row.pulled_messages:,.1f} messages, {row.pulled_bytes:,.0f} B",
+        "peers known": row.most_peers,
+        "CPU s of the run": round(row.cpu_s, 1),
     }
-    parts = ['<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 640 380" font-family="sans-serif" font-size="12">']
-    for power in range(7):
-        y = 330 - 50 * power
-        parts.append(f'<line x1="60" x2="580" y1="{y}" y2="{y}" stroke="#ddd"/><text x="8" y="{y + 4}">{10**power:,} B</text>')
-    for row in rows:
-        x = at(row, 1.0).split(",")[0]
-        parts.append(f'<text x="{x}" y="350" text-anchor="middle">{row.robots}</text>')
-    for i, (name, field) in enumerate(curves.items()):
-        colour = ("#0b6", "#06c", "#c60", "#999")[i]
-        points = " ".join(at(row, getattr(row, field)) for row in rows)
-        parts.append(f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="2"/>')
-        parts.append(f'<text x="{70 + 130 * i}" y="14" fill="{colour}">{name}</text>')
-    parts.append('<text x="320" y="370" text-anchor="middle">robots; bytes per robot and minute</text></svg>')
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text("\n".join(parts) + "\n")
+
+
+def chart(rows: list[Row]) -> str:
+    """Messages and bytes a robot and minute over the size of the fleet."""
+    curves = {"heard, B": "heard_bytes", "pushed, B": "pushed_bytes", "heard, messages": "heard_messages"}
+    curves |= {"pushed, messages": "pushed_messages"}
+    series = {name: [(float(row.robots), max(0.1, getattr(row, field))) for row in rows] for name, field in curves.items()}
+    return log_log_chart("What a fleet costs each robot", "robots", "a robot and minute, steady state", series)
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sizes", type=int, nargs="+", default=[2, 5, 10, 30, 100, 300, 1000])
-    parser.add_argument("--minutes", type=int, default=2)
+    parser.add_argument("--sizes", type=int, nargs="+", default=[2, 10, 30, 100, 300, 1000])
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--svg", type=Path, default=Path("out/fleet_scale.svg"))
+    parser.add_argument("--svg", type=Path, default=_PICTURE)
     args = parser.parse_args()
     rows = []
-    print("| robots | groups (largest) | heard a minute | pushed | pulled: first minute, later | CPU ms a robot-minute |")
-    print("| --- | --- | --- | --- | --- | --- |")
     for size in args.sizes:
-        rows.append(row := measure(size, args.minutes))
-        print(
-            f"| {row.robots} | {row.groups} ({row.largest_group}) | {row.heard_messages:,.0f} messages, {row.heard_bytes:,.0f} B "
-            f"| {row.sent_bytes:,.0f} B | {row.pulled_bytes_first:,.0f}, {row.pulled_bytes:,.0f} B | {row.cpu_ms:,.0f} |",
-            flush=True,
-        )
-        if args.json:
-            args.json.parent.mkdir(parents=True, exist_ok=True)
-            args.json.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
-    draw(rows, args.svg)
+        rows.append(measure(size))
+        print(json.dumps(asdict(rows[-1])), file=sys.stderr, flush=True)
+    print(markdown([shown(row) for row in rows]))
+    for file, text in ((args.json, json.dumps([asdict(row) for row in rows], indent=1) + "\n"), (args.svg, chart(rows))):
+        if file is not None:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(text)
     return 0
 
 

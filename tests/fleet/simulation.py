@@ -6,6 +6,7 @@ in a map frame of its own; the matcher knows the true transforms but judges ever
 
 from __future__ import annotations
 
+import functools
 import heapq
 import itertools
 import random
@@ -89,9 +90,11 @@ class Fleet:
         self.link = link or Link()
         self.judge = judge or truthful
         self.is_encoded = is_encoded
+        self._decode = decode if is_encoded else functools.lru_cache(maxsize=4_096)(decode)  # everybody reads the same object
         self.tick_s = TICK_S
         self.now_s = 0.0
         self.nodes: dict[str, Node] = {}
+        self._by_robot: dict[str, list[Node]] = {}
         self.partition: dict[str, int] = {}
         self.blocked: set[tuple[str, str]] = set()  # one-way cuts
         self._events: list[tuple[float, int, Callable[[], None]]] = []
@@ -102,6 +105,7 @@ class Fleet:
 
     def add(self, name: str, explorer: Explorer | None, options: FleetOptions | None = None, robot: str | None = None) -> Node:
         node = self.nodes[name] = Node(name, robot or name, explorer, options or FleetOptions())
+        self._by_robot.setdefault(node.robot, []).append(node)
         self.start(node)
         return node
 
@@ -241,7 +245,7 @@ class Fleet:
         if data is None:
             return None
         try:
-            message = decode(data)
+            message = self._decode(data)
             if isinstance(message, Manifest):
                 parts = []
                 for i in range(message.chunks):
@@ -251,7 +255,7 @@ class Fleet:
                         return None
                     parts.append(chunk.data)
                 data = b"".join(parts)
-                message = decode(data)
+                message = self._decode(data)
         except RemoteProtocolError:
             return None
         node.pulled_bytes += len(data)
@@ -295,7 +299,7 @@ class Fleet:
 
     def processes(self, robot: str) -> list[Node]:
         """Everything that runs under one robot id: one, unless there are twins."""
-        return [node for node in self.nodes.values() if node.robot == robot and node.is_up]
+        return [node for node in self._by_robot.get(robot, []) if node.is_up]
 
     def connects(self, a: str, b: str) -> bool:
         return self.partition.get(a, 0) == self.partition.get(b, 0) and (a, b) not in self.blocked
