@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from agent.mapping.estimate import MapperStatus, ScanOutcome
-from agent.mapping.mapper import CONFIRMED_AFTER, NEW_MAP_AFTER_S, Mapper
+from agent.mapping.mapper import CONFIRMED_AFTER, LOST_AFTER, NEW_MAP_AFTER_S, Mapper
 from agent.mapping.options import MappingOptions
 from hw.readings import LaserScan, Odometry
 from protocol.geometry import SE2
@@ -111,18 +111,20 @@ def test_a_turn_that_the_wheels_did_not_tell_is_seen_at_once(drive: Drive, turne
         assert abs(math.degrees(error.theta_rad)) < 2
 
 
-@pytest.mark.parametrize("floor_m", [0.8, 1.0, 1.5])
-def test_a_lidar_that_tilts_for_a_moment_and_sees_the_floor_does_not_move_the_robot(drive: Drive, floor_m: float) -> None:
+def test_a_jump_that_the_wheels_did_not_tell_is_believed_at_once_only_when_it_fits_very_well(drive: Drive) -> None:
     drive.steps(100)
-    here = drive.after.T_map_robot
-    for _ in range(2):
+    (now_s, before), jump = drive.path[100], SE2(-0.4, 0.0, 0.0)
+    drive.path[100:] = [(now_s + 0.2 * k, before @ jump) for k in range(10)]
+    drive.wheels.last = before @ jump
+    statuses = []
+    for _ in range(6):
         drive.mapper.add_odometry(drive.odometry())
-        level = drive.scan()
-        floor_at_m = floor_m / np.maximum(np.cos(level.angles_rad), 0.05)
-        tilted = replace(level, ranges_m=np.minimum(level.ranges_m, floor_at_m).astype(np.float32))
-        assert drive.mapper.add_scan(tilted).T_map_robot.distance_m(here) < 0.3
+        scan = drive.scan()
+        ranges_m = np.where(drive.rng.random(180) < 0.3, 0.6 * scan.ranges_m, scan.ranges_m).astype(np.float32)
+        statuses.append(drive.mapper.add_scan(replace(scan, ranges_m=ranges_m)).status)
         drive.at += 1
-    drive.steps(10)
+    assert statuses == [MapperStatus.LOST] * (LOST_AFTER - 1) + [MapperStatus.TRACKING] * 2
+    drive.steps(3)
     assert drive.error_m() < 0.06
 
 
