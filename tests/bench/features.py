@@ -36,6 +36,7 @@ from protocol.fields import FEATURES
 from protocol.geometry import SE2, wrap_angle
 from tests.bench.line_chart import exponent, log_log_chart
 from tests.bench.map_pairs import kit_pairs
+from tests.bench.tables import markdown
 from tests.harness.floorplans import office
 
 OUT = Path(__file__).resolve().parents[2] / "out" / "bench"
@@ -155,10 +156,12 @@ def _ms(work: Callable[[], object]) -> float:
 
 
 def as_markdown(*of: list[dict[str, Any]]) -> str:
-    tables, size = [], of[1]
-    for rows in filter(None, of):
-        tables.append("| " + " | ".join(rows[0]) + " |\n|" + "---|" * len(rows[0]))
-        tables[-1] += "".join("\n| " + " | ".join("-" if v is None else str(v) for v in row.values()) + " |" for row in rows)
+    size = of[1]
+    tables = [
+        markdown([{name: "-" if value is None else str(value) for name, value in row.items()} for row in rows])
+        for rows in of
+        if rows
+    ]
     growth = [
         f"{name} n^{exponent([(row['features'], row[name]) for row in size]):.2f}" for name in size[0] if name.endswith("_ms")
     ]

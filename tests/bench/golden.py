@@ -21,6 +21,7 @@ from hw.carmen import read_recording
 from hw.sim.devices import SickScanner
 from hw.sim.replay import Replay, ReplayBoard, ReplayScans
 from tests.bench.recordings import SHARED
+from tests.bench.tables import markdown
 from tests.harness import golden
 
 CARMEN_SPEED = 4.0
@@ -96,7 +97,7 @@ def replayed(run: golden.Run, particles: int) -> tuple[dict[str, Any], dict[str,
 
 
 def table(figures: dict[str, Any]) -> str:
-    return "\n".join("| " + " | ".join(map(str, row)) + " |" for row in (figures, ["---"] * len(figures), figures.values()))
+    return markdown([figures])
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from types import FrameType
 
 import cv2
 
+from tests.bench.tables import markdown
 from tests.harness import golden
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -93,8 +94,9 @@ def line(place: tuple[str, int], n: int, total: int) -> tuple[float, str, str]:
 
 def table(figures: dict[str, object]) -> str:
     head = [f"{name}: {figures[name]}" for name in ("CPU s", "share of a core a robot", "rooms")]
-    rows = [f"| {share:.1%} | {place} | `{text}` |" for share, place, text in figures["lines"]]  # type: ignore[attr-defined]
-    return "\n".join([*head, "", "| share | line | |", "| --- | --- | --- |", *rows])
+    lines = figures["lines"]
+    rows = [{"share": f"{share:.1%}", "line": place, "": f"`{text}`"} for share, place, text in lines]  # type: ignore[attr-defined]
+    return "\n".join([*head, "", markdown(rows)])
 
 
 if __name__ == "__main__":

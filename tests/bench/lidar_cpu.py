@@ -23,6 +23,7 @@ from hw.device import build_driver
 from hw.port import SerialPort
 from hw.supervisor import Device
 from hw.urls import parse_url
+from tests.bench.tables import markdown
 from tests.harness.lidar_streams import STREAMS, Stream
 
 SCHEMES = {"ld06": "ld19", "stl27l": "stl27l", "rplidar-0x81": "rplidar", "rplidar-0x82": "rplidar", "rplidar-0x85": "rplidar"}
@@ -69,14 +70,20 @@ def main() -> int:
     if args.json:
         print(json.dumps([asdict(row) for row in rows], indent=2))
         return 0
-    print("| device | kB/s | scans/s | points/s | CPU of one core | scan late by |")
-    print("|---|---|---|---|---|---|")
-    for row in rows:
-        print(
-            f"| {row.device} | {row.kilobytes_per_s:.1f} | {row.scans_per_s:.1f} | {row.points_per_s:,.0f} "
-            f"| {row.cpu_percent:.2f} % | {row.late_ms:.0f} ms |"
-        )
+    print(markdown([figures(row) for row in rows]))
     return 0
+
+
+def figures(row: Row) -> dict[str, str]:
+    """As people read them."""
+    return {
+        "device": row.device,
+        "kB/s": f"{row.kilobytes_per_s:.1f}",
+        "scans/s": f"{row.scans_per_s:.1f}",
+        "points/s": f"{row.points_per_s:,.0f}",
+        "CPU of one core": f"{row.cpu_percent:.2f} %",
+        "scan late by": f"{row.late_ms:.0f} ms",
+    }
 
 
 def measure(name: str, seconds: float) -> Row:

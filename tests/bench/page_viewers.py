@@ -26,6 +26,7 @@ from agent.view.server import ViewServer
 from protocol.features import FeatureMap
 from protocol.geometry import SE2
 from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from tests.bench.tables import markdown
 
 ROBOTS = ("r1", "r2", "r3", "r4")
 SIDE_CELLS = 400  # 20 m at 5 cm, as in the demo
@@ -162,12 +163,14 @@ def main() -> None:
     if args.json:
         print(json.dumps(found))
         return
-    print("| viewers | events/s each | maps/s each | bytes/s each, events + maps | CPU of the robot, % of a core |")
-    print("| --- | --- | --- | --- | --- |")
-    print(
-        f"| {found['viewers']} | {found['events_per_s']} | {found['maps_per_s']} | "
-        f"{found['event_bytes_per_s']} + {found['map_bytes_per_s']} | {found['cpu_percent']} |"
-    )
+    row = {
+        "viewers": found["viewers"],
+        "events/s each": found["events_per_s"],
+        "maps/s each": found["maps_per_s"],
+        "bytes/s each, events + maps": f"{found['event_bytes_per_s']} + {found['map_bytes_per_s']}",
+        "CPU of the robot, % of a core": found["cpu_percent"],
+    }
+    print(markdown([row]))
 
 
 if __name__ == "__main__":

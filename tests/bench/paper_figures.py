@@ -29,6 +29,7 @@ from agent.merging.result import MatchOptions, MatchStatus, MergeResult
 from protocol.geometry import SE2
 from tests.bench.map_pairs import MapPair, kit_pairs, simulated_pairs
 from tests.bench.recordings import SHARED
+from tests.bench.tables import markdown
 
 FFT = "fft, exhaustive"
 METHODS = ("paper", "paper-guarded", FFT, "hybrid")
@@ -74,17 +75,24 @@ def exhaustive(pair: MapPair) -> MergeResult:
 
 
 def as_markdown(rows: list[dict[str, Any]]) -> str:
-    lines = [
-        "| pair | features | method | candidates | agr | dis | MF | verdict | right? | error cm / deg | CPU ms |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
-    for r in rows:
-        error = "-" if r["error_cm"] is None else f"{r['error_cm']} / {r['error_deg']}"
-        lines.append(
-            f"| {r['pair']} | {r['features'][0]}, {r['features'][1]} | {r['method']} | {r['candidates']} | {r['agree']} | "
-            f"{r['disagree']} | {r['match_factor']:.3f} | {r['verdict']} | {judged(r)} | {error} | {r['cpu_ms']:.0f} |"
-        )
-    return "\n".join(lines)
+    return markdown(
+        [
+            {
+                "pair": r["pair"],
+                "features": f"{r['features'][0]}, {r['features'][1]}",
+                "method": r["method"],
+                "candidates": r["candidates"],
+                "agr": r["agree"],
+                "dis": r["disagree"],
+                "MF": f"{r['match_factor']:.3f}",
+                "verdict": r["verdict"],
+                "right?": judged(r),
+                "error cm / deg": "-" if r["error_cm"] is None else f"{r['error_cm']} / {r['error_deg']}",
+                "CPU ms": f"{r['cpu_ms']:.0f}",
+            }
+            for r in rows
+        ]
+    )
 
 
 def judged(row: dict[str, Any]) -> str:

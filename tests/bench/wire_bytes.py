@@ -30,6 +30,7 @@ from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from protocol.messages import CoarseMap, FineTiles
 from protocol.tiles import TileDelta, TileMap
 from tests.bench.recordings import SHARED
+from tests.bench.tables import markdown
 
 CELL_M, RANGE_M = 0.05, 25.0
 
@@ -143,14 +144,20 @@ def main() -> int:
     if args.json:
         args.json.parent.mkdir(parents=True, exist_ok=True)
         args.json.write_text(json.dumps([asdict(cost) for cost in costs], indent=1) + "\n")
-    print("| recording | features | coarse | all cells | PNG | an update: mean, median | PNG then | updates cost |")
-    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
-    for c in costs:
-        print(
-            f"| {c.log} ({c.updates} updates) | {c.features_bytes:,} B | {c.coarse_bytes:,} B | {c.fine_bytes:,} B "
-            f"| {c.png_bytes:,} B | {c.update_bytes:,.0f}, {c.update_median_bytes:,.0f} B | {c.png_update_bytes:,.0f} B "
-            f"| 1/{1 / c.ratio:.1f} |"
-        )
+    rows = [
+        {
+            "recording": f"{c.log} ({c.updates} updates)",
+            "features": f"{c.features_bytes:,} B",
+            "coarse": f"{c.coarse_bytes:,} B",
+            "all cells": f"{c.fine_bytes:,} B",
+            "PNG": f"{c.png_bytes:,} B",
+            "an update: mean, median": f"{c.update_bytes:,.0f}, {c.update_median_bytes:,.0f} B",
+            "PNG then": f"{c.png_update_bytes:,.0f} B",
+            "updates cost": f"1/{1 / c.ratio:.1f}",
+        }
+        for c in costs
+    ]
+    print(markdown(rows))
     return 0
 
 

@@ -20,6 +20,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from tests.bench.tables import markdown
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -49,8 +51,9 @@ def table(claims: Sequence[Claim], *, is_json: bool) -> str:
     """For people, or for programs."""
     if is_json:
         return json.dumps([asdict(claim) for claim in claims], indent=1)
-    rows = [f"| {c.claim} | {c.bar} | {c.measured} | {'holds' if c.holds else 'FAILS'} |" for c in claims]
-    return "\n".join(["| claim | bar | measured | |", "| --- | --- | --- | --- |", *rows])
+    return markdown(
+        [{"claim": c.claim, "bar": c.bar, "measured": c.measured, "": "holds" if c.holds else "FAILS"} for c in claims]
+    )
 
 
 def campaign(folder: Path, kills: int, rng: random.Random) -> Iterator[Claim]:

@@ -24,6 +24,7 @@ from agent.merging.fusion import fuse
 from protocol.geometry import SE2
 from protocol.messages import GlobalMap
 from protocol.tiles import TileMap
+from tests.bench.tables import markdown
 from tests.fleet.attackers import ATTACKS, Liar
 from tests.fleet.explorer import Explorer, random_world
 from tests.fleet.simulation import Fleet, Node
@@ -143,18 +144,21 @@ def main() -> int:
     if args.json:
         args.json.parent.mkdir(parents=True, exist_ok=True)
         args.json.write_text(json.dumps([asdict(verdict) for verdict in verdicts], indent=1) + "\n")
-    columns = "attack | altered: worst, at the end | misplaced | apart | liar out after | quarantined after | un-merge exact"
-    print(f"| {columns} |")
-    print("| --- | --- | --- | --- | --- | --- | --- |")
-    for name in dict.fromkeys(verdict.attack for verdict in verdicts):
-        own = [verdict for verdict in verdicts if verdict.attack == name]
-        print(
-            f"| {name} | {max(v.worst_share for v in own):.2%}, {max(v.final_share for v in own):.2%} "
-            f"| {max(v.misplaced for v in own)} | {max(v.separated for v in own)} "
-            f"| {_seconds([v.contained_s for v in own])} | {_seconds([v.quarantined_s for v in own])} "
-            f"| {sum(v.is_unmerge_exact for v in own)} of {len(own)} |"
-        )
+    names = dict.fromkeys(verdict.attack for verdict in verdicts)
+    print(markdown([_row(name, [verdict for verdict in verdicts if verdict.attack == name]) for name in names]))
     return 0 if all(is_good(verdict) for verdict in verdicts) else 1
+
+
+def _row(name: str, own: list[Verdict]) -> dict[str, object]:
+    return {
+        "attack": name,
+        "altered: worst, at the end": f"{max(v.worst_share for v in own):.2%}, {max(v.final_share for v in own):.2%}",
+        "misplaced": max(v.misplaced for v in own),
+        "apart": max(v.separated for v in own),
+        "liar out after": _seconds([v.contained_s for v in own]),
+        "quarantined after": _seconds([v.quarantined_s for v in own]),
+        "un-merge exact": f"{sum(v.is_unmerge_exact for v in own)} of {len(own)}",
+    }
 
 
 def is_good(verdict: Verdict) -> bool:

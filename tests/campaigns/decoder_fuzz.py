@@ -20,6 +20,7 @@ import numpy as np
 from hw import ld06, rplidar_nodes, rplidar_wire, scip, sick_lms, wheels, xv11, ydlidar_wire
 from hw.driver import Driver
 from hw.readings import LaserScan
+from tests.bench.tables import markdown
 from tests.harness.lidar_streams import STREAMS, Stream
 
 INPUTS_PER_DRIVER = 512  # before it must prove itself and is made anew
@@ -72,12 +73,17 @@ def main() -> int:
     if args.json:
         print(json.dumps(asdict(result), indent=2))
     else:
-        print("| inputs | MB | scans made of them | exceptions | insane scans | unbounded | deaf afterwards | CPU s |")
-        print("|---|---|---|---|---|---|---|---|")
-        print(
-            f"| {result.inputs:,} | {result.megabytes:.0f} | {result.scans:,} | {result.exceptions} "
-            f"| {result.insane_scans} | {result.unbounded} | {result.deaf} | {result.cpu_s} |"
-        )
+        row = {
+            "inputs": f"{result.inputs:,}",
+            "MB": f"{result.megabytes:.0f}",
+            "scans made of them": f"{result.scans:,}",
+            "exceptions": result.exceptions,
+            "insane scans": result.insane_scans,
+            "unbounded": result.unbounded,
+            "deaf afterwards": result.deaf,
+            "CPU s": result.cpu_s,
+        }
+        print(markdown([row]))
         print(result.first_failure)
     return int(result.failures > 0)
 

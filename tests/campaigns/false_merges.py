@@ -26,6 +26,7 @@ from typing import Any
 import cv2
 
 from agent.merging.matching import match_maps
+from tests.bench.tables import markdown
 from tests.campaigns.negative_pairs import folders, negatives
 
 REPO = Path(__file__).resolve().parents[2]
@@ -84,14 +85,14 @@ def report(results: list[dict[str, Any]]) -> str:
         tried.update(result["tried"])
         spent.update(result["spent_s"])
         merged.update(pair["kind"] for pair in result["merged"])
-    lines = ["| negative pairs | tried | merged | CPU ms a match |", "|---|---|---|---|"]
-    lines += [f"| {kind} | {tried[kind]} | {merged[kind]} | {1e3 * spent[kind] / tried[kind]:.0f} |" for kind in sorted(tried)]
     total = max(1, tried.total())
     whole_s = sum(result["all_s"] for result in results)
-    lines.append(f"| **all** | {tried.total()} | **{merged.total()}** | {1e3 * sum(spent.values()) / total:.0f} |")
-    return "\n".join(
-        [*lines, "", f"CPU {whole_s:.0f} s, {1e3 * whole_s / total:.0f} ms a pair with making the maps and their features"]
+    rows = [(kind, tried[kind], f"{merged[kind]}", spent[kind] / tried[kind]) for kind in sorted(tried)]
+    rows.append(("**all**", tried.total(), f"**{merged.total()}**", sum(spent.values()) / total))
+    table = markdown(
+        [{"negative pairs": kind, "tried": n, "merged": m, "CPU ms a match": f"{1e3 * cpu_s:.0f}"} for kind, n, m, cpu_s in rows]
     )
+    return f"{table}\n\nCPU {whole_s:.0f} s, {1e3 * whole_s / total:.0f} ms a pair with making the maps and their features"
 
 
 def main() -> int:

@@ -23,6 +23,8 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
+from tests.bench.tables import markdown
+
 ROOT = Path(__file__).resolve().parents[2]
 REASON_CHARS = 160
 
@@ -99,10 +101,8 @@ def _compute() -> None:
 
 
 def table(figures: dict[str, object], failed: Counter[str], reasons: dict[str, str]) -> str:
-    names = ("rounds", "tests run", "load", "minutes")
-    lines = ["| " + " | ".join([*names, "failed ever"]) + " |", "|" + " --- |" * (len(names) + 1)]
-    lines.append("| " + " | ".join([*(str(figures[name]) for name in names), str(len(failed))]) + " |")
-    return "\n".join([*lines, *(f"- {name}: {n} times: {reasons[name]}" for name, n in failed.most_common())])
+    row = {name: figures[name] for name in ("rounds", "tests run", "load", "minutes")} | {"failed ever": len(failed)}
+    return "\n".join([markdown([row]), *(f"- {name}: {n} times: {reasons[name]}" for name, n in failed.most_common())])
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import cv2
 
+from tests.bench.tables import markdown
 from tests.fleet.schedules import Outcome, run_schedule
 
 
@@ -74,12 +75,14 @@ def main() -> int:
         args.json.parent.mkdir(parents=True, exist_ok=True)
         args.json.write_text(json.dumps(figures, indent=1) + "\n")
     s = figures["converged_s"]
-    print("| schedules | fault episodes | invariants broken | wrong edges | converged after calm p50 / p90 / p99 / max |")
-    print("| --- | --- | --- | --- | --- |")
-    print(
-        f"| {figures['schedules']} | {figures['fault_episodes']} | {len(failures)} | {figures['wrong_edges']} "
-        f"| {s['p50']:.1f} / {s['p90']:.1f} / {s['p99']:.1f} / {s['max']:.1f} s |"
-    )
+    row = {
+        "schedules": figures["schedules"],
+        "fault episodes": figures["fault_episodes"],
+        "invariants broken": len(failures),
+        "wrong edges": figures["wrong_edges"],
+        "converged after calm p50 / p90 / p99 / max": f"{s['p50']:.1f} / {s['p90']:.1f} / {s['p99']:.1f} / {s['max']:.1f} s",
+    }
+    print(markdown([row]))
     return 1 if failures else 0
 
 

@@ -25,6 +25,7 @@ from typing import Any
 
 from agent.commands.children import AgentProcess
 from agent.runtime.control import ControlError
+from tests.bench.tables import markdown
 from tests.harness.disk_work import SECONDS, live
 from tests.harness.failing_disk import FailingDisk
 from tests.harness.waiting import until
@@ -46,8 +47,8 @@ def main(argv: list[str] | None = None) -> int:
     if args.json:
         print("\n".join(json.dumps(row) for row in rows))
     else:
-        print("| what | runs | failed calls | crashes | wrong | which calls |\n|" + " --- |" * 6)
-        print("\n".join("| " + " | ".join(str(value) for value in row.values()) + " |" for row in rows))
+        columns = ("what", "runs", "failed calls", "crashes", "wrong", "which calls")
+        print(markdown([dict(zip(columns, row.values(), strict=True)) for row in rows]))
     return 1 if any(row["crashes"] or row["wrong"] for row in rows) else 0
 
 

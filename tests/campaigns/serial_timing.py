@@ -21,6 +21,7 @@ from pathlib import Path
 from hw.device import open_lidar
 from hw.health import DeviceHealth, DeviceState
 from hw.supervisor import Device
+from tests.bench.tables import markdown
 from tests.harness.serial_device import SerialDevice
 
 BARS = {"stall noticed": 0.5, "stream back": 2.0, "unplug noticed": 0.2, "back after replug": 1.0}
@@ -40,9 +41,11 @@ def main() -> int:
     if args.json:
         print(json.dumps(rows, indent=2))
     else:
-        print(f"{args.rounds} rounds\n\n| | median | worst | bar |\n|---|---|---|---|")
-        for name, row in rows.items():
-            print(f"| {name} | {row['median_s']:.2f} s | {row['worst_s']:.2f} s | {row['bar_s']} s |")
+        print(f"{args.rounds} rounds\n")
+        spoken = [
+            {"": name} | {figure.removesuffix("_s"): f"{s:.2f} s" for figure, s in row.items()} for name, row in rows.items()
+        ]
+        print(markdown(spoken))
     return int(any(row["worst_s"] > row["bar_s"] for row in rows.values()))
 
 

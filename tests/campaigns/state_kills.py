@@ -28,6 +28,7 @@ from pathlib import Path
 
 from agent.commands.children import AgentProcess, ChildError
 from agent.runtime.state import CorruptState, StateDirectory, pack, unpack
+from tests.bench.tables import markdown
 
 NAME = "mapper"
 MAX_BYTES = 64 * 1024
@@ -84,9 +85,8 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def table(rows: list[dict[str, object]]) -> str:
-    columns = list(dict.fromkeys(name for row in rows for name in row))
-    lines = ["| " + " | ".join(columns) + " |", "|" + " --- |" * len(columns)]
-    return "\n".join(lines + ["| " + " | ".join(str(row.get(name, "")) for name in columns) + " |" for row in rows])
+    columns = dict.fromkeys(name for row in rows for name in row)
+    return markdown([{name: row.get(name, "") for name in columns} for row in rows])
 
 
 # The writer.

@@ -21,6 +21,7 @@ import numpy as np
 from hw import arduino_bridge, create2, kobuki, roboclaw, wheels
 from hw.odometry import BaseProtocol, WheelGeometry
 from hw.wheel_driver import WheelDriver
+from tests.bench.tables import markdown
 from tests.harness.bad_line import KINDS, damaged
 
 FRAMES = (
@@ -150,18 +151,21 @@ class Judge:
 
 def table(tallies: list[Tally], share: float, kind: str) -> str:
     """Markdown."""
-    lines = [
-        f"{share:.3%} of the bytes lost or altered, {'one by one' if kind == 'bytes' else 'in bursts'}",
-        "",
-        "| base | robot-hours | damaged bytes | readings | discontinuities | teleports | worst excess | CPU |",
-        "|---|---|---|---|---|---|---|---|",
+    rows = [
+        {
+            "base": t.base,
+            "robot-hours": f"{t.robot_hours:.1f}",
+            "damaged bytes": f"{t.damaged_bytes:,}",
+            "readings": f"{t.readings:,} ({t.readings / t.frames_sent:.0%})",
+            "discontinuities": f"{t.discontinuities:,}",
+            "teleports": t.teleports,
+            "worst excess": f"{100 * t.worst_excess_m:.1f} cm",
+            "CPU": f"{t.cpu_s:.0f} s",
+        }
+        for t in tallies
     ]
-    for t in tallies:
-        lines.append(
-            f"| {t.base} | {t.robot_hours:.1f} | {t.damaged_bytes:,} | {t.readings:,} ({t.readings / t.frames_sent:.0%}) "
-            f"| {t.discontinuities:,} | {t.teleports} | {100 * t.worst_excess_m:.1f} cm | {t.cpu_s:.0f} s |"
-        )
-    return "\n".join(lines)
+    how = "one by one" if kind == "bytes" else "in bursts"
+    return f"{share:.3%} of the bytes lost or altered, {how}\n\n{markdown(rows)}"
 
 
 if __name__ == "__main__":

@@ -31,6 +31,7 @@ from protocol.codec import HEADER_BYTES, MAGIC, decode, decode_versions, encode
 from protocol.errors import LocalProtocolError, RemoteProtocolError
 from protocol.messages import FineTiles, GlobalTiles
 from protocol.security import unseal
+from tests.bench.tables import markdown
 from tests.protocol.examples import examples
 
 _NASTY: tuple[Any, ...] = (
@@ -209,12 +210,15 @@ def main() -> int:
         args.json.write_text(json.dumps(figures, indent=1) + "\n")
     for data, trouble in escapes[:5]:
         print(f"{data[:400]}\n{trouble}", file=sys.stderr)
-    print("| inputs | escapes or accepted invalid | accepted, valid | RSS growth | p99.9 | slowest |")
-    print("| --- | --- | --- | --- | --- | --- |")
-    print(
-        f"| {figures['inputs']:,} | {figures['escapes']} | {seen['accepted']:,} | {figures['rss_growth_mb']} MB "
-        f"| {figures['p99.9_ms']} ms | {figures['max_ms']} ms |"
-    )
+    row = {
+        "inputs": f"{figures['inputs']:,}",
+        "escapes or accepted invalid": figures["escapes"],
+        "accepted, valid": f"{seen['accepted']:,}",
+        "RSS growth": f"{figures['rss_growth_mb']} MB",
+        "p99.9": f"{figures['p99.9_ms']} ms",
+        "slowest": f"{figures['max_ms']} ms",
+    }
+    print(markdown([row]))
     return 1 if figures["escapes"] else 0
 
 
