@@ -7,7 +7,6 @@ Packets 43 and 44 count the wheels and wrap at 65536 both ways: 0.444565 mm a co
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Mapping
 
 from hw.framing import ByteWindow, Counters, SizedFrames
@@ -57,11 +56,6 @@ def decode_stream(frame: bytes) -> dict[int, int] | None:
 def stream_request(packets: tuple[int, ...]) -> bytes:
     """Ask for these packets every 15 ms."""
     return bytes((STREAM, len(packets), *packets))
-
-
-def drive_direct(left_mm_s: int, right_mm_s: int) -> bytes:
-    """Wheel speeds, -500 to 500 mm/s."""
-    return struct.pack(">Bhh", 145, right_mm_s, left_mm_s)
 
 
 class Create2(Quiet):

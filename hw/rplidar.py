@@ -39,7 +39,6 @@ class Rplidar(SpinningLidar):
         self.health: wire.Health | None = None
         self.scan_type: int | None = None  # what the stream carries now
         self._mode, self._rpm, self._pwm = mode, rpm, pwm
-        self._rate: wire.SampleRate | None = None
         self._conf: wire.Conf | None = None
         self._board_flag: int | None = None
         self._single: wire.Descriptor | None = None
@@ -227,8 +226,6 @@ class Rplidar(SpinningLidar):
             self.identity.firmware = f"{info.firmware[0]}.{info.firmware[1]:02d}"
         elif kind == wire.HEALTH_TYPE:
             self.health = wire.Health.decode(body)
-        elif kind == wire.SAMPLERATE_TYPE:
-            self._rate = wire.SampleRate.decode(body)
         elif kind == wire.CONF_TYPE:
             self._conf = wire.Conf.decode(body)
         elif kind == wire.BOARD_FLAG_TYPE and len(body) >= 4:

@@ -67,7 +67,6 @@ class ScanAssembler:
         self._hole_s = LONGEST_HOLE * self.period_s
         self.coverage = 0.0  # of the last scan
         self.witnesses: tuple[int, ...] = (1,)  # see `supported_only`
-        self.discarded = 0  # revolutions with too little in them
         self._pending: list[Beams] = []
         self._pending_n = 0
         self._is_whole = False  # the pending beams begin at a cut
@@ -131,7 +130,6 @@ class ScanAssembler:
         is_dirty = beams.is_dirty is not None and bool(beams.is_dirty.any())
         self._dirty_turns.append(is_dirty)
         if coverage < LEAST_COVERAGE:
-            self.discarded += 1
             return None
         self.coverage = coverage
         return self._scan(beams, coverage, self._is_suspect())

@@ -127,17 +127,13 @@ def cobs_decode(wire: bytes) -> bytes | None:
 class WheelDecoder:
     """Bytes in any pieces to frames; bounded, total, counts what it refuses."""
 
-    bytes_seen: int = 0
     frames: int = 0
     bad_frames: int = 0
-    lost_frames: int = 0  # by gaps in `seq`
     info: InfoFrame | None = None
     _pending: bytearray = field(default_factory=bytearray)
     _is_overlong: bool = False
-    _sequence: int | None = None
 
     def feed(self, data: bytes) -> list[Frame]:
-        self.bytes_seen += len(data)
         frames = []
         *ends, tail = data.split(b"\0")
         for piece in ends:
@@ -172,10 +168,6 @@ class WheelDecoder:
         self.frames += 1
         if isinstance(frame, InfoFrame):
             self.info = frame
-            return
-        if self._sequence is not None and not frame.flags & FLAG_BOOT:
-            self.lost_frames += (frame.sequence - self._sequence - 1) % 256
-        self._sequence = frame.sequence
 
 
 class WheelBoard(Quiet):

@@ -41,12 +41,6 @@ class SE2:
     def identity() -> SE2:
         return SE2(0.0, 0.0, 0.0)
 
-    @staticmethod
-    def from_matrix(matrix: ArrayLike) -> SE2:
-        """From a homogeneous 3x3 matrix, taken to be rigid."""
-        m = np.asarray(matrix, dtype=np.float64)
-        return SE2(float(m[0, 2]), float(m[1, 2]), math.atan2(m[1, 0], m[0, 0]))
-
     def __matmul__(self, other: SE2) -> SE2:
         c, s = math.cos(self.theta_rad), math.sin(self.theta_rad)
         return SE2(

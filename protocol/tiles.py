@@ -113,9 +113,6 @@ class TileMap:
     def is_on_lattice_of(self, other: TileMap) -> bool:
         return self.resolution_m == other.resolution_m and self.anchor == other.anchor
 
-    def known_cells(self) -> int:
-        return sum(int(np.count_nonzero(_tiles_to_trits([tile]))) for tile in self.tiles.values())
-
 
 @dataclass(frozen=True, slots=True)
 class TileDelta:

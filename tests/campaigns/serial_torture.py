@@ -41,7 +41,6 @@ class Tally:
     refused_frames: int = 0  # the checksum was right, the content impossible
     scans_sent: int = 0
     scans: int = 0  # handed on
-    partial_scans: int = 0
     beams: int = 0
     wrong_scans: int = 0
     wrong_beams: int = 0
@@ -101,7 +100,6 @@ def _feed(driver: Driver, data: bytes, now_s: float, stream: Stream, tally: Tall
     errors = np.nan_to_num(errors_m(angles, ranges), nan=0.0)
     is_wrong = errors > WRONG_M
     tally.scans += len(scans)
-    tally.partial_scans += sum(scan.is_partial for scan in scans)
     tally.beams += int(np.isfinite(ranges).sum())
     tally.worst_error_m = max(tally.worst_error_m, round(float(errors.max()), 3))
     if is_wrong.any():

@@ -26,7 +26,6 @@ class Cable:
         self.mode: Mode = mode
         self.delay_s = 0.05
         self.bytes_per_s = 8_000  # 64 kbit/s
-        self.carried_bytes = 0
         self.port = 0
         self._server: asyncio.Server | None = None
         self._writers: set[asyncio.StreamWriter] = set()
@@ -85,7 +84,6 @@ class Cable:
                     continue
                 if self.mode == "slow":
                     await asyncio.sleep(self.delay_s + len(data) / self.bytes_per_s)
-                self.carried_bytes += len(data)
                 writer.write(data)
                 await writer.drain()
         writer.transport.abort()
