@@ -1,4 +1,4 @@
-"""What a fleet costs each robot as it grows, up to a thousand robots, in simulation.
+"""What a fleet costs each robot as it grows, in simulation.
 
     .venv/bin/python -m tests.campaigns.fleet_scale [--sizes 2 10 30 100 300 1000] [--json FILE] [--svg FILE]
 
