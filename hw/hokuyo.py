@@ -16,6 +16,7 @@ from hw.driver import Ask, Drain, DriverBase, Pause, Reading, Script, Send, SetB
 from hw.errors import DeviceError, DeviceSilent
 from hw.framing import ByteWindow
 from hw.readings import LaserScan
+from hw.scan_assembler import supported_only
 from hw.scip import (
     SCAN_ECHO,
     URG_04LX,
@@ -29,6 +30,7 @@ from hw.scip import (
     scan_command,
     scan_of,
 )
+from hw.suspicion import Suspicion
 
 CLOCK_PERIOD_S = 2**24 / 1e3
 MOST_MESSAGE_BYTES = 16384  # ME of 1081 steps takes 6.9 kB
@@ -50,6 +52,7 @@ class Hokuyo(DriverBase):
         self._is_usb = True
         self._window = ByteWindow(self.counters, 4 * MOST_MESSAGE_BYTES)
         self._clock = DeviceClock(CLOCK_PERIOD_S)
+        self._suspicion = Suspicion()
         self._answers: dict[bytes, Message] = {}
         self._command = b""
 
@@ -177,7 +180,7 @@ class Hokuyo(DriverBase):
             self.counters.skip(len(block) + 2)
             return None
         self.counters.skip(max(0, at + 1) if at < len(block) else 0)
-        self.counters.good()
+        self._suspicion.note(self.counters.good())
         return message
 
     def _scan(self, scan: ScanData, arrived_s: float) -> LaserScan:
@@ -191,6 +194,8 @@ class Hokuyo(DriverBase):
             metres = np.where((metres < self.range_min_m) | (metres > self.range_max_m), np.nan, metres)
         if self._sees_nothing_as_free:
             metres = np.where(scan.values == (1 if p.model.startswith("UTM") else 0), np.inf, metres)
+        if self._suspicion:
+            metres = supported_only(metres)
         self.coverage = 1.0
         offsets_s = ((steps - scan.first_step) * step_s).astype(np.float32)
         return LaserScan(

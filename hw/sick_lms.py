@@ -20,6 +20,7 @@ from hw.errors import DeviceSilent
 from hw.framing import ByteWindow, SizedFrames
 from hw.readings import LaserScan
 from hw.scan_assembler import supported_only
+from hw.suspicion import Suspicion
 
 STX, ACK, NAK = 0x02, 0x06, 0x15
 ACKS = (bytes((ACK,)), bytes((NAK,)))
@@ -40,7 +41,6 @@ MIRROR_S = 1 / 75  # a turn of the mirror; half- and quarter-degree scans take t
 RANGE_MIN_M, RANGE_MAX_M = 0.05, 80.0
 CM_CODES, MM_CODES = 0x1FF7, 0x7FF7  # from here on a value is no distance: dazzled, out of range, ...
 HEAD_BYTES = 4
-SUSPECT_SCANS = 8  # after damage on the line so many scans are looked at twice: a 16-bit sum misses one bad telegram in 65536
 
 
 def crc16(data: bytes | bytearray) -> int:
@@ -128,7 +128,7 @@ class SickLms(DriverBase):
         )
         self._answers: dict[int, bytes] = {}
         self._last_scan_s: float | None = None
-        self._suspect_scans = 0
+        self._suspicion = Suspicion()
         self._held: LaserScan | None = None  # on a line that is not clean, until the next telegram begins
 
     def limit(self, range_min_m: float, range_max_m: float) -> None:
@@ -176,7 +176,7 @@ class SickLms(DriverBase):
         readings: list[Reading] = []
         for row, behind, gap in zip(frames.data, frames.behind.tolist(), frames.gap.tolist(), strict=True):
             readings += self._released(is_followed=gap == 0)
-            self._suspect_scans = SUSPECT_SCANS if gap else max(0, self._suspect_scans - 1)
+            self._suspicion.note(gap)
             n = int(row[2]) | int(row[3]) << 8
             payload = row[4 : 4 + n].tobytes()
             scan = ScanPayload.decode(payload)
@@ -184,7 +184,7 @@ class SickLms(DriverBase):
                 self._answers[payload[0]] = payload
             else:
                 self._held = self._scan(scan, now_s - (behind + 6 + n) * 10.0 / self.baud)
-        if not self._suspect_scans or self.counters.gap_bytes or len(self._window) >= HEAD_BYTES:
+        if not self._suspicion or self.counters.gap_bytes or len(self._window) >= HEAD_BYTES:
             readings += self._released(is_followed=not self.counters.gap_bytes)
         return readings
 
@@ -193,7 +193,7 @@ class SickLms(DriverBase):
         scan, self._held = self._held, None
         if scan is None:
             return []
-        if self._suspect_scans and not is_followed:
+        if self._suspicion and not is_followed:
             self.counters.rejected += 1
             return []
         return [scan]
@@ -205,7 +205,7 @@ class SickLms(DriverBase):
         metres = ranges_m(scan)
         with np.errstate(invalid="ignore"):
             metres = np.where((metres < self.range_min_m) | (metres > self.range_max_m), np.nan, metres)
-        if self._suspect_scans:
+        if self._suspicion:
             metres = supported_only(metres)
         if self._last_scan_s is not None and 0.005 < end_s - self._last_scan_s < 2.0:
             self.period_s = 0.8 * self.period_s + 0.2 * (end_s - self._last_scan_s)
