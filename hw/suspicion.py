@@ -7,7 +7,7 @@ filtered, its damage must come after N clean scans; of scans damaged with chance
 
 from __future__ import annotations
 
-SUSPECT_SCANS = 4000  # N
+SUSPECT_SCANS = 100  # N; the filter costs beams of a noisy scanner, so it ends seconds after the last damage
 FIRST_SCANS = 8  # suspect when the first frame stands behind other bytes, which need not be damage
 
 
