@@ -8,6 +8,7 @@ same piece, wherever the rest of their curves end.  Pieces of one size never sha
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,6 @@ MIN_FILL = 1.0  # wall in a piece, in radii: less is a splinter
 MAX_POINTS = 2000
 MAX_STARTS = 250
 MAX_PER_RADIUS = 16
-_BLOCK = 25  # centres at a time, so that what they need stays in cache
 _SHIFTS = 3  # mean-shift steps; most settle in two
 
 
@@ -29,63 +29,93 @@ def curve_table(points_m: NDArray[np.float64], normals: NDArray[np.float64], spa
         return np.zeros((0, len(CURVE_COLUMNS)), np.float32)
     stride = -(-len(points_m) // MAX_POINTS)
     points_m, normals, spacing_m = points_m[::stride], normals[::stride], spacing_m * stride
-    rows = [row for radius_m in RADII_M for row in _pieces(points_m, normals, radius_m, spacing_m)]
-    return np.array(rows, np.float32).reshape(-1, len(CURVE_COLUMNS))
+    return np.concatenate([_pieces(points_m, normals, radius_m, spacing_m) for radius_m in RADII_M])
 
 
-def _pieces(points: NDArray[np.float64], normals: NDArray[np.float64], radius_m: float, spacing_m: float) -> list[list[float]]:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Squares:
+    """Points sorted by the square of a lattice they lie in, so that those near a place are found without asking all."""
+
+    points: NDArray[np.float64]  # (N, 2) sorted
+    order: NDArray[np.int64]  # (N,) rows of the points as they came
+    keys: NDArray[np.int64]  # (N,) ascending
+    low: NDArray[np.float64]  # (2,)
+    side_m: float
+    columns: int
+
+    @staticmethod
+    def of(points: NDArray[np.float64], side_m: float) -> _Squares:
+        low = points.min(axis=0) - side_m
+        x, y = np.floor((points - low) / side_m).astype(np.int64).T
+        columns = int(x.max()) + 2
+        keys = y * columns + x
+        order = np.argsort(keys, kind="stable")
+        return _Squares(points[order], order, keys[order], low, side_m, columns)
+
+    def within_side(self, centres: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows (centre, sorted point) of all pairs nearer than a side, by centre."""
+        x, y = np.floor((centres - self.low) / self.side_m).astype(np.int64).T
+        middle = (y * self.columns + x)[:, None] + self.columns * np.array([-1, 0, 1])
+        first, end = np.searchsorted(self.keys, middle - 1), np.searchsorted(self.keys, middle + 1, side="right")
+        counts = (end - first).ravel()
+        point = np.arange(counts.sum()) + np.repeat(first.ravel() - (np.cumsum(counts) - counts), counts)
+        centre = np.repeat(np.arange(len(centres)), (end - first).sum(axis=1))
+        away = self.points[point] - centres[centre]
+        near = away[:, 0] ** 2 + away[:, 1] ** 2 < self.side_m**2
+        return centre[near], point[near]
+
+
+def _pieces(points: NDArray[np.float64], normals: NDArray[np.float64], radius_m: float, spacing_m: float) -> NDArray[np.float32]:
     """Disjoint pieces of one radius, the fullest first."""
-    centres = _settled(points, radius_m)
-    members = _within(points, centres, radius_m)
-    order = np.lexsort((centres[:, 1], centres[:, 0], -members.sum(axis=1)))
+    squares = _Squares.of(points, radius_m)
+    centres = _settled(points, squares)
+    owner, member = squares.within_side(centres)
+    counts = np.bincount(owner, minlength=len(centres))
+    starts = np.cumsum(counts) - counts
     free = np.ones(len(points), np.bool_)
-    rows: list[list[float]] = []
-    for i in order.tolist():
-        if len(rows) == MAX_PER_RADIUS:
+    pieces: list[NDArray[np.int64]] = []
+    for i in np.lexsort((centres[:, 1], centres[:, 0], -counts)).tolist():
+        if len(pieces) == MAX_PER_RADIUS or counts[i] * spacing_m < MIN_FILL * radius_m:
             break
-        mine = members[i]
-        if mine.sum() * spacing_m < MIN_FILL * radius_m or not free[mine].all():
-            continue
-        free[mine] = False
-        rows.append(_described(points[mine], normals[mine], spacing_m))
-    return rows
+        mine = member[starts[i] : starts[i] + counts[i]]
+        if free[mine].all():
+            free[mine] = False
+            pieces.append(mine)
+    if not pieces:
+        return np.zeros((0, len(CURVE_COLUMNS)), np.float32)
+    rows = np.concatenate(pieces)
+    return _described(squares.points[rows], normals[squares.order[rows]], np.array([len(p) for p in pieces]), spacing_m)
 
 
-def _settled(points: NDArray[np.float64], radius_m: float) -> NDArray[np.float64]:
+def _settled(points: NDArray[np.float64], squares: _Squares) -> NDArray[np.float64]:
     """(K, 2) places where mean shift ends, started from one point in every square of half the radius."""
-    square = np.floor(points / (0.5 * radius_m)).astype(np.int64)
+    square = np.floor(points / (0.5 * squares.side_m)).astype(np.int64)
     _, first = np.unique((square[:, 0] << 32) + square[:, 1], return_index=True)
-    first = first[:: -(-len(first) // MAX_STARTS)]
-    middle = points.mean(axis=0)
-    local = (points - middle).astype(np.float32)
-    weighed = np.column_stack([local, np.ones(len(points), np.float32)])
-    centres = local[first]
-    for block in range(0, len(centres), _BLOCK):
-        mine = np.s_[block : block + _BLOCK]
-        for _ in range(_SHIFTS):
-            sums = _within(local, centres[mine], radius_m).astype(np.float32) @ weighed
-            centres[mine] = sums[:, :2] / np.maximum(sums[:, 2:], 1.0)
-    settled: NDArray[np.float64] = centres + middle
-    return settled
+    centres: NDArray[np.float64] = points[first[:: -(-len(first) // MAX_STARTS)]]
+    for _ in range(_SHIFTS):
+        owner, member = squares.within_side(centres)
+        centres = _means(squares.points[member], owner, len(centres))
+    return centres
 
 
-def _within(points: NDArray[np.floating], centres: NDArray[np.floating], radius_m: float) -> NDArray[np.bool_]:
-    """(K, N) which points lie within the radius of which centres."""
-    dx = points[None, :, 0] - centres[:, None, 0]
-    dy = points[None, :, 1] - centres[:, None, 1]
-    near: NDArray[np.bool_] = dx * dx + dy * dy < radius_m**2
-    return near
+def _means(values: NDArray[np.float64], owner: NDArray[np.int64], n: int) -> NDArray[np.float64]:
+    """(n, 2) mean of the values of every owner."""
+    count = np.maximum(np.bincount(owner, minlength=n), 1)
+    means: NDArray[np.float64] = np.stack([np.bincount(owner, values[:, k], n) / count for k in (0, 1)], axis=1)
+    return means
 
 
-def _described(points: NDArray[np.float64], normals: NDArray[np.float64], spacing_m: float) -> list[float]:
+def _described(
+    points: NDArray[np.float64], normals: NDArray[np.float64], sizes: NDArray[np.int64], spacing_m: float
+) -> NDArray[np.float32]:
     """Centre of mass, normal of the regression line towards the free side, length of wall, uncertainty of the centre."""
-    centre = points.mean(axis=0)
-    away = points - centre
-    xx, yy, xy = (away[:, 0] ** 2).mean(), (away[:, 1] ** 2).mean(), (away[:, 0] * away[:, 1]).mean()
-    normal_rad = 0.5 * math.atan2(2 * xy, xx - yy) + math.pi / 2
-    mean_normal = normals.mean(axis=0)
-    if mean_normal[0] * math.cos(normal_rad) + mean_normal[1] * math.sin(normal_rad) < 0:
-        normal_rad += math.pi
-    spread = math.sqrt(max(xx + yy, 0.0) / 2)
-    sigma = math.hypot(0.03, spread / max(len(points), 1))  # a point more or less at the rim shifts the mean by this
-    return [float(centre[0]), float(centre[1]), math.remainder(normal_rad, math.tau), len(points) * spacing_m, sigma]
+    owner, n = np.repeat(np.arange(len(sizes)), sizes), len(sizes)
+    centre = _means(points, owner, n)
+    x, y = (points - centre[owner]).T
+    xx, yy, xy = (np.bincount(owner, w, n) / sizes for w in (x * x, y * y, x * y))
+    normal_rad = 0.5 * np.arctan2(2 * xy, xx - yy) + math.pi / 2
+    mean_x, mean_y = _means(normals, owner, n).T
+    backwards = mean_x * np.cos(normal_rad) + mean_y * np.sin(normal_rad) < 0
+    normal_rad = np.remainder(normal_rad + math.pi * backwards + math.pi, math.tau) - math.pi
+    sigma = np.hypot(0.03, np.sqrt(np.maximum(xx + yy, 0.0) / 2) / sizes)  # a point at the rim shifts the mean by this
+    return np.column_stack([centre, normal_rad, sizes * spacing_m, sigma]).astype(np.float32)

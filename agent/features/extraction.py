@@ -47,8 +47,10 @@ def feature_map(working: WorkingGrid, walls: WallPoints, lines: WallLines, T_map
     line_of = _line_of_points(working, walls, lines)
     lengths_m = np.append(lines.lengths_m, 0.0)  # the last entry is for line -1, none
     loose = np.flatnonzero(lengths_m[line_of] < MAX_CHORD_M)
-    loose = loose[_is_sizeable(working, walls.cells_rc[loose])]
-    arcs = find_arcs(cells_m[loose], _piece_numbers(working, walls.cells_rc[loose]), working.resolution_m)
+    piece = _piece_numbers(walls.cells_rc[loose])
+    sizeable = np.bincount(piece)[piece] * working.resolution_m >= MIN_PIECE_M
+    loose, piece = loose[sizeable], piece[sizeable]
+    arcs = find_arcs(cells_m[loose], piece, working.resolution_m)
     on_arc = np.zeros(len(walls), np.bool_)
     on_arc[loose] = _explained(arcs, cells_m[loose], working.resolution_m)
     kept = _straight_lines(lines, arcs, working.resolution_m)
@@ -79,13 +81,7 @@ def _line_of_points(working: WorkingGrid, walls: WallPoints, lines: WallLines) -
     return canvas[walls.cells_rc[:, 0], walls.cells_rc[:, 1]].astype(np.int64)
 
 
-def _is_sizeable(working: WorkingGrid, cells_rc: NDArray[np.int32]) -> NDArray[np.bool_]:
-    piece = _piece_numbers(working, cells_rc)
-    sizeable: NDArray[np.bool_] = np.bincount(piece)[piece] * working.resolution_m >= MIN_PIECE_M
-    return sizeable
-
-
-def _piece_numbers(working: WorkingGrid, cells_rc: NDArray[np.int32]) -> NDArray[np.int64]:
+def _piece_numbers(cells_rc: NDArray[np.int32]) -> NDArray[np.int64]:
     """(N,) number of the connected piece of each cell; cells two apart still touch."""
     if not len(cells_rc):
         return np.zeros(0, np.int64)

@@ -7,6 +7,7 @@ Positions here are in the *grid frame*: metres from the lower-left corner of the
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +34,7 @@ class WorkingGrid:
         free = (grid.cells == FREE).view(np.uint8)
         if factor > 1:
             occupied = _block_sums(occupied, factor) > 0
-            free = (_block_sums(free, factor) * 2 >= factor * factor) & ~occupied
+            free = (_block_sums(free, factor) >= (factor * factor + 1) // 2) & ~occupied
         return WorkingGrid(
             np.ascontiguousarray(occupied).view(np.uint8),
             np.ascontiguousarray(free).view(np.uint8),
@@ -48,14 +49,16 @@ def _factor(grid: OccupancyGrid) -> int:
     return factor
 
 
-def _block_sums(mask: NDArray[np.uint8], k: int) -> NDArray[np.int32]:
+def _block_sums(mask: NDArray[np.uint8], k: int) -> NDArray[Any]:
     """Sums over k x k blocks; the last row and column of blocks may hang over the edge."""
     h, w = mask.shape
-    padded = np.pad(mask, ((0, -h % k), (0, -w % k)))
-    sums = np.zeros((padded.shape[0] // k, padded.shape[1] // k), np.int32)
-    for row in range(k):
-        for col in range(k):
-            sums += padded[row::k, col::k]
+    padded = np.pad(mask, ((0, -h % k), (0, -w % k))) if h % k or w % k else mask
+    of_rows = padded[::k].astype(np.uint8 if k * k < 256 else np.int32)
+    for row in range(1, k):
+        of_rows += padded[row::k]
+    sums = of_rows[:, ::k].copy()
+    for col in range(1, k):
+        sums += of_rows[:, col::k]
     return sums
 
 

@@ -21,7 +21,6 @@ from agent.features.extraction import extract_features, feature_map
 from agent.features.field import MatchField
 from agent.features.lines import wall_lines
 from agent.features.paper import paper_features
-from agent.features.round_walls import _arcs_of_piece
 from agent.features.signatures import MAX_TARGETS
 from agent.features.snapshot import MapSnapshot
 from agent.features.wall_points import wall_points
@@ -111,7 +110,7 @@ def _stages(rooms: int) -> dict[str, Any]:
         "paper_features": len(mine),
         "wall_points_ms": _ms(lambda: wall_points(working)),
         "lines_ms": _ms(lambda: wall_lines(walls, working.resolution_m)),
-        "round_and_curves_ms": _ms(lambda: (_arcs_of_piece.cache_clear(), feature_map(working, walls, lines, ours.origin))),
+        "round_and_curves_ms": _ms(lambda: feature_map(working, walls, lines, ours.origin)),
         "field_ms": _ms(lambda: MatchField.of(working, walls)),
         "signatures_ms": _ms(lambda: ours_kept._signatures(MAX_TARGETS)),
         "first_pass_ms": _ms(lambda: search(ours_kept, theirs_kept, FIRST_PASS)),
