@@ -97,8 +97,7 @@ class Fits:
 
     def off_m(self) -> NDArray[np.float64]:
         """(N,) how far each cell lies from its circle."""
-        x, y, radius = self.circles[self.owner].T
-        off: NDArray[np.float64] = np.abs(np.hypot(self.points_m[:, 0] - x, self.points_m[:, 1] - y) - radius)
+        off: NDArray[np.float64] = np.abs(_radial(self.points_m, self.circles[self.owner])[1])
         return off
 
 
@@ -123,11 +122,11 @@ def _promising(pieces: Pieces) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """The best hypotheses: (C,) their piece, ascending, and (C, 3) the circle, the better first."""
     circles = _through_three(pieces)
     of_point = np.repeat(np.arange(len(pieces.sizes)), pieces.sizes)
-    away = pieces.points_m.astype(np.float32)[:, :, None] - circles[:, :2].astype(np.float32)[of_point]
-    off = np.abs(np.hypot(away[:, 0], away[:, 1]) - circles[:, 2].astype(np.float32)[of_point])
-    on, beside = off < pieces.tolerance_m, off < 3 * pieces.tolerance_m
-    value = on * np.float32(1 + MAX_CLUTTER) - beside * np.float32(MAX_CLUTTER)
-    hits = np.add.reduceat(value, pieces.starts, axis=0)
+    x0, y0, radius = (circles[:, k].astype(np.float32)[of_point] for k in range(3))
+    x, y = (pieces.points_m[:, k].astype(np.float32)[:, None] - centre for k, centre in enumerate((x0, y0)))
+    off = np.abs(np.sqrt(x * x + y * y) - radius)
+    on, near = (np.add.reduceat(off < k * pieces.tolerance_m, pieces.starts, axis=0, dtype=np.int32) for k in (1, 3))
+    hits = on - MAX_CLUTTER * (near - on)
     best = np.argsort(-hits, axis=1, kind="stable")[:, :TRIES]
     enough = np.take_along_axis(hits, best, axis=1) * pieces.wall_m[:, None] >= MIN_LENGTH_M * MIN_DENSITY
     piece, rank = np.nonzero(enough)
@@ -140,8 +139,8 @@ def _through_three(pieces: Pieces) -> NDArray[np.float64]:
     of_point = np.repeat(np.arange(len(pieces.sizes)), pieces.sizes)
     first = (_FIRST[None] * pieces.sizes[:, None]).astype(np.int64)
     reach = np.asarray(REACHES_M)[np.arange(HYPOTHESES) % len(REACHES_M)]
-    away = points[:, :, None] - points[starts[:, None] + first].transpose(0, 2, 1)[of_point]
-    near = away[:, 0] ** 2 + away[:, 1] ** 2 <= reach**2
+    x, y = (points.T[:, :, None] - points[starts[:, None] + first].transpose(2, 0, 1)[:, of_point]).astype(np.float32)
+    near = x * x + y * y <= (reach * reach).astype(np.float32)
     lots = np.where(near, _ORDER[np.arange(len(points)) - starts[of_point]], _NO_DRAW)
     column = np.arange(HYPOTHESES)[None]
     lots[starts[:, None] + first, column] = _NO_DRAW
@@ -190,7 +189,7 @@ def _longest_runs(fits: Fits, tolerance: float) -> Fits:
     owner, circles = fits.owner[rows], len(fits.circles)
     away = fits.points_m[rows] - fits.circles[owner, :2]
     angle = np.arctan2(away[:, 1], away[:, 0])
-    order = np.lexsort((angle, owner))
+    order = np.argsort(angle + 7.0 * owner)  # more than a turn apart
     rows, angle = rows[order], angle[order]
     count = np.bincount(owner, minlength=circles)
     first = np.cumsum(count) - count
@@ -200,7 +199,7 @@ def _longest_runs(fits: Fits, tolerance: float) -> Fits:
     gap = angle[following] - angle
     gap[last] += math.tau
     is_break = gap > np.maximum(GAP_M / fits.circles[:, 2], math.radians(8))[owner]
-    is_break[np.lexsort((gap, owner))[last]] = True
+    is_break[np.argsort(gap + 7.0 * owner)[last]] = True
     cuts = np.bincount(owner[is_break], minlength=circles)
     earlier: NDArray[np.int64] = np.cumsum(is_break) - is_break
     base = np.cumsum(cuts) - cuts
@@ -230,7 +229,7 @@ def _fitted(fits: Fits) -> Fits:
     algebraic = np.column_stack([middle[:, 0] + a, middle[:, 1] + b, np.sqrt(np.maximum(radius2, 0.0))])
     circles = np.where((radius2 > 0)[:, None], algebraic, fits.circles)
     for _ in range(2):
-        towards, residual = _radial(points, circles[owner])
+        towards, residual = _jacobian(points, circles[owner])
         circles = circles + _solved(towards, residual, owner, n)
     return Fits(fits.piece, circles, fits.start_rad, fits.span_rad, fits.owner, fits.points_m, fits.on)
 
@@ -253,10 +252,16 @@ def _normal_matrix(A: NDArray[np.float64], owner: NDArray[np.int64], n: int) -> 
 
 
 def _radial(points: NDArray[np.float64], circles: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Unit vectors from the centre to each point, and how far beyond its circle the point lies."""
+    """Vectors from the centre to each point, and how far beyond its circle the point lies."""
     away = points - circles[:, :2]
-    distance = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-9)
-    return away / distance[:, None], distance - circles[:, 2]
+    x, y = away.T
+    return away, np.sqrt(x * x + y * y) - circles[:, 2]
+
+
+def _jacobian(points: NDArray[np.float64], circles: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Unit vectors from the centre to each point, and how far beyond its circle the point lies."""
+    away, beyond = _radial(points, circles)
+    return away / np.maximum(beyond + circles[:, 2], 1e-9)[:, None], beyond
 
 
 def _are_round(fits: Fits, pieces: Pieces) -> NDArray[np.bool_]:
@@ -279,7 +284,7 @@ def _are_round(fits: Fits, pieces: Pieces) -> NDArray[np.bool_]:
 def _sigma_m(fits: Fits, cell_m: float) -> NDArray[np.float64]:
     """(C,) uncertainty of centre and radius together: the largest of the three."""
     owner, n = fits.owner[fits.on], len(fits.circles)
-    towards, residual = _radial(fits.points_m[fits.on], fits.circles[owner])
+    towards, residual = _jacobian(fits.points_m[fits.on], fits.circles[owner])
     xx, xy, xz, yy, yz, zz = _normal_matrix(towards, owner, n)
     information = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
     spread2 = np.maximum(np.bincount(owner, residual**2, n) / zz, (0.29 * cell_m) ** 2)

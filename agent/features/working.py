@@ -55,10 +55,10 @@ def _block_sums(mask: NDArray[np.uint8], k: int) -> NDArray[Any]:
     padded = np.pad(mask, ((0, -h % k), (0, -w % k))) if h % k or w % k else mask
     of_rows = padded[::k].astype(np.uint8 if k * k < 256 else np.int32)
     for row in range(1, k):
-        of_rows += padded[row::k]
+        np.add(of_rows, padded[row::k], out=of_rows)
     sums = of_rows[:, ::k].copy()
     for col in range(1, k):
-        sums += of_rows[:, col::k]
+        np.add(sums, of_rows[:, col::k], out=sums)
     return sums
 
 
