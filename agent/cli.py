@@ -1,6 +1,8 @@
 """`mapquilt COMMAND ...`: one table of commands, each in a module of its own that is imported only when asked for.
 
 A command module offers `EXAMPLES` (text), `add_arguments(parser)` and `run(args) -> int`.  Data goes to stdout, talk to stderr.
+Who asked for `--json` gets JSON whatever happens: a failure is one object with `error` and `exit_code`, beside what the module's
+`WITHOUT_ANSWER` promises (`merge`: accepted, x, y, ...).
 """
 
 from __future__ import annotations
@@ -8,6 +10,7 @@ from __future__ import annotations
 import argparse
 import difflib
 import importlib
+import json
 import os
 import signal
 import sys
@@ -15,6 +18,7 @@ import threading
 import traceback
 from signal import default_int_handler
 from types import ModuleType
+from typing import Any, NoReturn
 
 from agent import __version__
 from agent.exits import BUG, EXIT_CODES, INTERRUPTED, OK, USAGE, CommandError
@@ -64,8 +68,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         return _dispatch(argv)
     except CommandError as error:
-        complain(str(error))
-        return error.code
+        return _failed(argv, str(error), error.code)
     except KeyboardInterrupt:
         return INTERRUPTED
     except BrokenPipeError:  # `mapquilt features map.yaml | head`: the reader has seen enough
@@ -73,12 +76,17 @@ def main(argv: list[str] | None = None) -> int:
         return OK
     except Exception as error:
         traceback.print_exc()
-        complain(f"this is a bug of ours ({type(error).__name__}: {error}); please report it with the lines above")
-        return BUG
+        said = f"this is a bug of ours ({type(error).__name__}: {error}); please report it with the lines above"
+        return _failed(argv, said, BUG)
 
 
-def complain(message: str) -> None:
+def _failed(argv: list[str], message: str, code: int) -> int:
     print(f"mapquilt: {message}", file=sys.stderr)
+    name = next((word for word in argv if word in COMMANDS), None)
+    if name is not None and "--json" in argv:
+        promised = getattr(sys.modules.get(COMMANDS[name][0]), "WITHOUT_ANSWER", {})
+        print(json.dumps({**promised, "error": message, "exit_code": code}))
+    return code
 
 
 def _dispatch(argv: list[str]) -> int:
@@ -145,10 +153,24 @@ def _without_command(argv: list[str]) -> int:
     return USAGE
 
 
+class _Parser(argparse.ArgumentParser):
+    """One that answers a mistake with one sentence, as everything else here does."""
+
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
+        parsed, unknown = self.parse_known_args(args, namespace)
+        if unknown:
+            options = [option for option in self._option_string_actions if option.startswith("--")]
+            near = difflib.get_close_matches(unknown[0].partition("=")[0], options, 1)
+            hint = f"; did you mean '{near[0]}'?" if near else f"; {self.prog} --help lists what there is"
+            raise CommandError(f"{self.prog.partition(' ')[2]}: unknown argument '{unknown[0]}'{hint}", USAGE)
+        return parsed
+
+    def error(self, message: str) -> NoReturn:
+        raise CommandError(f"{self.prog.partition(' ')[2]}: {message}; {self.prog} --help shows examples", USAGE)
+
+
 def _parser(prog: str, description: str) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog, description=description, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
-    )
+    parser = _Parser(prog, description=description, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False)
     parser.add_argument("-q", "--quiet", action="store_true", help="say only what went wrong")
     parser.add_argument("-v", "--verbose", action="store_true", help="say more")
     parser.add_argument("--no-color", action="store_true", help="plain text (also: NO_COLOR=1)")

@@ -28,17 +28,23 @@ FLAGS: tuple[tuple[str, str, str, str], ...] = (  # flag, setting, placeholder, 
     ("--view-port", "view.port", "PORT", "port of the live page (default: 8080)"),
     ("--seed", "mapping.seed", "N", "seed of the particle filter"),
 )
+NETWORK = ("fleet.name", "fleet.profile", "fleet.listen", "fleet.connect", "fleet.security")
 LISTS = ("fleet.listen", "fleet.connect", "fleet.priors")
 
 
-def add_config_arguments(parser: argparse.ArgumentParser) -> None:
+def add_config_arguments(parser: argparse.ArgumentParser, *of: str) -> None:
+    """Flags for the settings that a command heeds: `"fleet"` a section, `"robot.id"` one of them; none named: all."""
     group = parser.add_argument_group("settings", "the file is read first, then MAPQUILT_SECTION__KEY variables, then these")
     group.add_argument("--config", metavar="FILE", help="settings file (default: ~/.config/mapquilt/config.toml)")
     for flag, setting, placeholder, text in FLAGS:
+        if of and setting not in of and setting.partition(".")[0] not in of:
+            continue
         action = "append" if setting in LISTS else "store"
         group.add_argument(flag, dest=_slot(setting), metavar=placeholder, help=text, action=action)
-    group.add_argument("--no-view", action="store_true", help="serve no page")
-    group.add_argument("--ros2", action="store_true", help="show maps and frames to ROS 2 nodes (rmw_zenoh)")
+    if not of:
+        group.add_argument("--no-view", action="store_true", help="serve no page")
+    if not of or "ros2" in of:
+        group.add_argument("--ros2", action="store_true", help="show maps and frames to ROS 2 nodes (rmw_zenoh)")
     group.add_argument("--set", dest="assignments", action="append", default=[], metavar="KEY=VALUE", help="any other setting")
 
 

@@ -5,7 +5,10 @@ Sockets of one's own robots lie in one's runtime directory, those of systemd's s
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import os
+import socket
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,7 +21,32 @@ SERVICES = Path("/run/mapquilt")
 
 
 def running_robots(environ: Mapping[str, str] | None = None) -> dict[str, Path]:
-    """Name -> socket, one's own first; a socket may be left over from a crash."""
+    """Name -> socket, one's own first."""
+    return {robot: path for robot, path in _sockets(environ).items() if not _is_left_over(path)}
+
+
+def robot_socket(robot: str | None, environ: Mapping[str, str] | None = None) -> tuple[str, Path]:
+    """The robot that is meant: the named one, or the only one there is."""
+    found = running_robots(environ)
+    gone = [name for name in _sockets(environ) if name not in found and robot in (None, name)]
+    ended = f"; {', '.join(gone)} ended without a word and does not answer" if gone else ""
+    if robot is not None:
+        if robot not in found:
+            there = f"running here: {', '.join(found)}" if found else "none runs here"
+            raise CommandError(
+                f"no robot '{robot}' runs here under this user ({there}){ended}; a service is root's: try sudo", PEER
+            )
+        return robot, found[robot]
+    if not found:
+        raise CommandError(
+            f"no robot runs here under this user{ended}; start one with mapquilt run, or try sudo for a service", PEER
+        )
+    if len(found) > 1:
+        raise CommandError(f"several robots run here; say which one with --robot: {', '.join(found)}", USAGE)
+    return next(iter(found.items()))
+
+
+def _sockets(environ: Mapping[str, str] | None) -> dict[str, Path]:
     own = runtime_dir(os.environ if environ is None else environ)
     found: dict[str, Path] = {}
     for pattern, folder in (("*.sock", own), ("*.sock", SERVICES), ("*/*.sock", SERVICES)):
@@ -31,19 +59,12 @@ def running_robots(environ: Mapping[str, str] | None = None) -> dict[str, Path]:
     return found
 
 
-def robot_socket(robot: str | None, environ: Mapping[str, str] | None = None) -> tuple[str, Path]:
-    """The robot that is meant: the named one, or the only one there is."""
-    found = running_robots(environ)
-    if robot is not None:
-        if robot not in found:
-            there = f"running here: {', '.join(found)}" if found else "none runs here"
-            raise CommandError(f"no robot '{robot}' runs here under this user ({there}); a service is root's: try sudo", PEER)
-        return robot, found[robot]
-    if not found:
-        raise CommandError("no robot runs here under this user; start one with mapquilt run, or try sudo for a service", PEER)
-    if len(found) > 1:
-        raise CommandError(f"several robots run here; say which one with --robot: {', '.join(found)}", USAGE)
-    return next(iter(found.items()))
+def _is_left_over(path: Path) -> bool:
+    """From a robot that was killed: nobody listens."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe, contextlib.suppress(OSError):
+        probe.settimeout(0.5)
+        return probe.connect_ex(str(path)) == errno.ECONNREFUSED
+    return False
 
 
 def ask_robot(socket: Path, command: str, **arguments: object) -> dict[str, Any]:

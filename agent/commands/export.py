@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--map", metavar="NAME", help="global, or a robot's id (default: the robot's own map)")
     parser.add_argument("--robot", metavar="ID", help="which robot, when several run here")
     parser.add_argument("--saved", action="store_true", help="take what is on disk, even when the robot runs")
-    add_config_arguments(parser)
+    add_config_arguments(parser, "robot.id", "state")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

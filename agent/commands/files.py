@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 
 from agent.exits import BAD_INPUT, ENVIRONMENT, CommandError
@@ -25,10 +27,20 @@ def saved_map(grid: OccupancyGrid, stem: Path) -> list[Path]:
         raise _cannot_write(stem, error) from error
 
 
-def written_file(path: Path, data: bytes) -> Path:
+def writable(path: Path) -> Path:
+    """The same path, in a folder that is there and may be written: found out before the work, not after it."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, data)
+    except OSError as error:
+        raise _cannot_write(path, error) from error
+    if not os.access(path.parent, os.W_OK):
+        raise _cannot_write(path, PermissionError(errno.EACCES, os.strerror(errno.EACCES)))
+    return path
+
+
+def written_file(path: Path, data: bytes) -> Path:
+    try:
+        write_atomically(writable(path), data)
     except OSError as error:
         raise _cannot_write(path, error) from error
     return path

@@ -23,6 +23,8 @@ from agent.running import ask_robot, robot_socket
 from agent.view.render import png
 from protocol.geometry import SE2
 
+WITHOUT_ANSWER = {"found": False, "status": "error", "x": None, "y": None, "theta": None, "reason": "error"}
+
 EXAMPLES = """\
   mapquilt localize room.yaml building.yaml           room.yaml's frame in building.yaml's; exit code 0: found, 1: not
   mapquilt localize room.yaml building.yaml --json    the same as one JSON object

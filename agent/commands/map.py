@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.commands.files import saved_map, written_file
+from agent.commands.files import saved_map, writable, written_file
 from agent.exits import BAD_INPUT, NEGATIVE, OK, USAGE, CommandError
 from agent.mapping.estimate import MapEstimate
 from agent.mapping.mapper import Mapper
@@ -63,6 +63,8 @@ class Drawn:
 
 def run(args: argparse.Namespace) -> int:
     options = _options(args)
+    if args.output is not None:
+        writable(args.output)
     try:
         recording = open_recording(args.log, args.scan_topic, args.odom_topic)
     except RecordingError as error:

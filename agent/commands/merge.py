@@ -11,13 +11,20 @@ import json
 import sys
 from pathlib import Path
 
+from agent.commands.files import loaded_map, writable
 from agent.commands.merge_files import LoadedMap, Merged, merge_files, write_merged
-from agent.exits import BAD_INPUT, NEGATIVE, OK, USAGE, CommandError
-from agent.map_files import MapFileError, load_map
+from agent.exits import BAD_INPUT, ENVIRONMENT, NEGATIVE, OK, USAGE, CommandError
 from agent.merging.errors import FusionError
 from agent.merging.result import MatchOptions
 
 METHODS = ("hybrid", "paper", "paper-guarded")
+
+WITHOUT_ANSWER = {  # what --json holds when there is an error instead of a verdict
+    "accepted": False,
+    "status": "error",
+    "reason": "error",
+    **dict.fromkeys(("x", "y", "theta", "score", "match_factor")),
+}
 
 EXAMPLES = """\
   mapquilt merge a.yaml b.yaml                  do they fit, and how?  exit code 0: yes, 1: no
@@ -46,7 +53,9 @@ def run(args: argparse.Namespace) -> int:
         raise CommandError(f"merge: one map ({args.maps[0]}); give two or more", USAGE)
     if args.resolution is not None and not 0.001 <= args.resolution <= 10:
         raise CommandError(f"merge: --resolution {args.resolution:g}; cells measure 0.001 to 10 m", USAGE)
-    maps = [_loaded(path) for path in args.maps]
+    if args.output is not None:
+        writable(args.output)
+    maps = [LoadedMap(str(path), loaded_map(path)) for path in args.maps]
     merged = merge_files(maps, MatchOptions(method=args.method))
     written = _written(merged, args)
     if args.json:
@@ -59,13 +68,6 @@ def run(args: argparse.Namespace) -> int:
     return OK if merged.is_complete else NEGATIVE
 
 
-def _loaded(path: Path) -> LoadedMap:
-    try:
-        return LoadedMap(str(path), load_map(path))
-    except (MapFileError, OSError) as error:
-        raise CommandError(f"merge: {error}", BAD_INPUT) from error
-
-
 def _written(merged: Merged, args: argparse.Namespace) -> list[Path]:
     if args.output is None:
         return []
@@ -74,4 +76,4 @@ def _written(merged: Merged, args: argparse.Namespace) -> list[Path]:
     except FusionError as error:
         raise CommandError(f"merge: {error}", BAD_INPUT) from error
     except OSError as error:
-        raise CommandError(f"merge: cannot write {args.output}: {error.strerror}; is the folder there and writable?") from error
+        raise CommandError(f"{args.output}: cannot be written ({error.strerror or error})", ENVIRONMENT) from error

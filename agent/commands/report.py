@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("report.html"), metavar="FILE.html", help="default: report.html"
     )
-    add_config_arguments(parser)
+    add_config_arguments(parser, "robot.id", "state")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -9,7 +9,7 @@ import os
 import threading
 
 from agent.commands.run import StopSignals, die_with_parent
-from agent.config_flags import add_config_arguments, load_from
+from agent.config_flags import NETWORK, add_config_arguments, load_from
 from agent.exits import OK, PEER, USAGE, CommandError
 from agent.runtime.exchange import Exchange, ExchangeError
 from agent.runtime.health import Notifier
@@ -25,7 +25,7 @@ EXAMPLES = """\
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_config_arguments(parser)
+    add_config_arguments(parser, "robot.id", *NETWORK)
     parser.add_argument("--ready-json", action="store_true", help="print one JSON line with addresses once the router is up")
     parser.add_argument("--die-with-parent", type=int, metavar="PID", help=argparse.SUPPRESS)
 

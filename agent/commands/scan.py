@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from agent.commands.files import written_file
 from agent.commands.scan_picture import scan_picture
 from agent.exits import NEGATIVE, OK, USAGE, CommandError
 from agent.view.render import png
@@ -49,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     if last is None:
         raise CommandError(device.health().last_error or f"{args.device}: no scan came", NEGATIVE)
     if args.png:
-        args.png.write_bytes(png(scan_picture(last)))
+        written_file(args.png, png(scan_picture(last)))
         print(f"{args.png}: {len(last.ranges_m)} beams", file=sys.stderr)
     print(f"{count} scans", file=sys.stderr)
     return OK

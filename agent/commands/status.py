@@ -34,15 +34,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     if not (math.isfinite(args.interval) and args.interval >= 0.1):
         raise CommandError(f"status: --interval {args.interval:g}; take 0.1 s or more", USAGE)
-    sockets = [robot_socket(args.robot)[1]] if args.robot else list(running_robots().values()) or [robot_socket(None)[1]]
-    before: dict[str, Facts] = {}
-    while True:
-        statuses = [ask_robot(socket, "status")["status"] for socket in sockets]
-        _show(statuses, before, args)
-        if not args.watch:
-            return OK
-        before = {status["robot"]: status for status in statuses}
+    statuses = _ask_all(args.robot)
+    _show(statuses, {}, args)
+    while args.watch:
         time.sleep(args.interval)
+        before = {status["robot"]: status for status in statuses}
+        try:
+            statuses = _ask_all(args.robot)
+        except CommandError as error:  # it may come back: a service is started again
+            print(error, file=sys.stderr)
+            continue
+        _show(statuses, before, args)
+    return OK
+
+
+def _ask_all(robot: str | None) -> list[Facts]:
+    sockets = running_robots().values() if robot is None else []
+    return [ask_robot(socket, "status")["status"] for socket in sockets or [robot_socket(robot)[1]]]
 
 
 def _show(statuses: Sequence[Facts], before: Mapping[str, Facts], args: argparse.Namespace) -> None:
@@ -93,7 +101,7 @@ def _device(device: Facts, colour: bool) -> str:
 def _fleet(status: Facts, before: Facts | None) -> Iterator[str]:
     group, network = status["group"], status["network"]
     together = f"one map with {', '.join(r for r in group if r != status['robot'])}" if group else "alone so far"
-    net = f"{len(network['links'])} links, {network['profile']}, {network['security']}"
+    net = f"{counted(len(network['links']), 'link')}, {network['profile']}, {network['security']}"
     yield f"{printable(status['fleet'])}: {printable(together)}; {net}"
     sent, received = traffic(status)
     if before is None:
@@ -118,9 +126,10 @@ def _fits_for_s(status: Facts, peer: str) -> float | None:
 
 def _peer(peer: Facts, fits_for_s: float | None, colour: bool) -> str:
     factor = f", match factor {peer['match_factor']:.3f}" if peer.get("match_factor") else ""
-    tried = f", {peer['attempts']} attempts" if peer.get("attempts") else ""
+    tried = f", {counted(peer['attempts'], 'attempt')}" if peer.get("attempts") else ""
     reason = f" ({printable(peer['reason'])})" if peer.get("reason") else ""
-    pair = _state(peer["pair"], colour) + (f" for {duration(fits_for_s)}" if fits_for_s is not None else "")
+    word = "no fit seen yet" if peer["pair"] == "unseen" else peer["pair"]
+    pair = _state(word, colour) + (f" for {duration(fits_for_s)}" if fits_for_s is not None else "")
     return f"{printable(peer['robot'])} {_state(peer['state'], colour)} {peer['age_s']:.1f} s ago, {pair}{factor}{tried}{reason}"
 
 
@@ -133,6 +142,10 @@ def _merging(took: Facts) -> str:
     return f"{took['p50_s']:.1f} s from hearing a peer to fitting its map" + (
         f" in the middle of {took['peers']}, {took['p90_s']:.1f} s for the slowest tenth" if took["peers"] > 1 else ""
     )
+
+
+def counted(n: int, noun: str) -> str:
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
 def _state(word: str, colour: bool) -> str:

@@ -15,7 +15,7 @@ import threading
 from dataclasses import replace
 
 from agent.commands.run import StopSignals, join_ros2, serve_page
-from agent.config_flags import add_config_arguments, load_from
+from agent.config_flags import NETWORK, add_config_arguments, load_from
 from agent.exits import OK, PEER, USAGE, CommandError
 from agent.runtime.exchange import ExchangeError
 from agent.runtime.log_setup import set_up_logging
@@ -31,7 +31,7 @@ EXAMPLES = """\
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_config_arguments(parser)
+    add_config_arguments(parser, "robot.id", *NETWORK, "view", "ros2")
     parser.add_argument("--ready-json", action="store_true", help="print one JSON line with addresses once the page is up")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import re
 import shlex
 import signal
@@ -50,6 +51,31 @@ def test_an_unknown_command_is_answered_with_the_nearest(capsys: pytest.CaptureF
     assert main(["xyzzy"]) == 2
     assert "--help lists them" in capsys.readouterr().err
     assert main([]) == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("run --wheel wt1:/dev/x", "run: unknown argument '--wheel'; did you mean '--wheels'?"),
+        ("merge a.yaml b.yaml --outptu=x", "merge: unknown argument '--outptu=x'; did you mean '--output'?"),
+        ("pause nonsense", "pause: unknown argument 'nonsense'; mapquilt pause --help lists what there is"),
+        ("unmerge", "unmerge: the following arguments are required: PEER; mapquilt unmerge --help shows examples"),
+    ],
+)
+def test_a_mistyped_flag_is_answered_in_one_line(words: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(words.split()) == 2
+    assert capsys.readouterr() == ("", f"mapquilt: {said}\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "code"), [("merge a.yaml b.yaml", 4), ("merge a.yaml", 2), ("merge", 2), ("merge a.yaml b.yaml --nonsense", 2)]
+)
+def test_json_is_one_object_also_when_it_fails(words: str, code: int, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*words.split(), "--json"]) == code
+    out, err = capsys.readouterr()
+    answer = json.loads(out)
+    assert (answer["accepted"], answer["status"], answer["exit_code"]) == (False, "error", code)
+    assert err == f"mapquilt: {answer['error']}\n"
 
 
 @pytest.mark.parametrize(

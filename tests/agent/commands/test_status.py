@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,10 +23,10 @@ def test_a_status_tells_the_robot_in_a_few_lines(run: Run, robot: StartRobot) ->
         "r1  up 1 h 2 min",
         "  mapping  tracking, 82 m2 known, 120 scans (1 lost), 2.3 ms CPU each",
         "  lidar    running 10.0 Hz, 450 points, LD06, ld06:/dev/ttyUSB0",
-        "  fleet    mapquilt: one map with r2; 1 links, lan, shared",
+        "  fleet    mapquilt: one map with r2; 1 link, lan, shared",
         "  fleet    sent 2.0 KB, received 0.5 KB",
         "  peer     r2 alive 0.2 s ago, merged for 2 min 5 s, match factor 0.961, 3 attempts",
-        "  peer     r3?[2J lost 45.0 s ago, no, 1 attempts (little common wall)",
+        "  peer     r3?[2J lost 45.0 s ago, no, 1 attempt (little common wall)",
         "  together 130 m2 of r1, r2; 12 cells conflict and are unknown",
         "  merging  4.2 s from hearing a peer to fitting its map",
         "           ! wheels wheels:/dev/ttyACM0: no such port",
@@ -77,10 +78,33 @@ def test_without_a_robot_there_is_a_sentence(run: Run, robot: StartRobot) -> Non
 def test_a_crashed_robot_does_not_answer(run: Run, robot: StartRobot) -> None:
     crashed = robot("r1")
     crashed.server.close()
-    crashed.server.path.touch()
-    ended = run("status")
+    with socket.socket(socket.AF_UNIX) as nobody:
+        nobody.bind(str(crashed.server.path))
+    ended = run("status", "--json")
     assert ended.code == 5
-    assert "does not answer" in ended.err
+    assert "r1 ended without a word and does not answer; start one" in ended.err
+    assert json.loads(ended.out)["exit_code"] == 5
+
+
+def test_a_crashed_robot_does_not_hide_the_others(run: Run, robot: StartRobot) -> None:
+    crashed, _ = robot("r1"), robot("r2")
+    crashed.server.close()
+    with socket.socket(socket.AF_UNIX) as nobody:
+        nobody.bind(str(crashed.server.path))
+    assert run("status").out.startswith("r2  up")
+    assert run("pause").code == 0
+
+
+def test_watching_goes_on_while_a_robot_starts_again(run: Run, robot: StartRobot, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop() -> None:
+        raise KeyboardInterrupt
+
+    meanwhile = [robot("r1").server.close, lambda: robot("r1"), stop]
+    monkeypatch.setattr("agent.commands.status.time.sleep", lambda _: meanwhile.pop(0)())
+    ended = run("status", "--watch")
+    assert ended.code == 130
+    assert ended.out.count("r1  up") == 2
+    assert ended.err.startswith("no robot runs here")
 
 
 def test_a_word_reaches_the_robot_that_is_meant(run: Run, robot: StartRobot) -> None:
