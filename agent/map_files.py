@@ -31,6 +31,8 @@ from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 MODES = ("trinary", "scale", "raw")
 OCCUPIED_THRESH, FREE_THRESH = 0.65, 0.196
 OCCUPIED_SHADE, UNKNOWN_SHADE, FREE_SHADE = 0, 205, 254
+SAVED_SHADES = (OCCUPIED_SHADE, UNKNOWN_SHADE, FREE_SHADE)
+DRAWN_OVER = 0.05  # of the pixels of a map that somebody has edited
 MAX_YAML_BYTES = 64 * 1024
 RESOLUTIONS_M = (0.001, 10.0)
 SURE_OCCUPIED, SURE_FREE = 70, 30  # percent; the paper's thresholds, for the in-between values of `scale` and `raw`
@@ -110,19 +112,23 @@ def as_saved(pixels: Pixels, settings: MapSettings) -> MapSettings:
     """The thresholds that the writer meant.
 
     nav2's map_saver draws unknown as 205 and wrote free_thresh 0.25 beside it until 2025 (navigation2 pull request 5278): by that
-    all it did not know is free.  Its three shades give it away.
+    all it did not know is free.  Its three shades give it away, also where somebody has drawn a little with others.
     """
-    is_its_own = settings.mode == "trinary" and not settings.negate and pixels.ndim == 2 and pixels.dtype == np.uint8
-    if not is_its_own or settings.free_thresh <= FREE_THRESH:
+    if settings.mode != "trinary" or settings.negate or settings.free_thresh <= FREE_THRESH or pixels.dtype != np.uint8:
         return settings
-    shades = set(np.flatnonzero(np.bincount(pixels.ravel(), minlength=256)).tolist())
-    return replace(settings, free_thresh=FREE_THRESH) if shades <= {OCCUPIED_SHADE, UNKNOWN_SHADE, FREE_SHADE} else settings
+    counts = np.bincount((pixels if pixels.ndim == 2 else pixels[:, :, 0]).ravel(), minlength=256)
+    is_its_own = counts[list(SAVED_SHADES)].sum() >= (1 - DRAWN_OVER) * counts.sum()
+    return replace(settings, free_thresh=FREE_THRESH) if is_its_own else settings
 
 
 def cells_of(pixels: Pixels, settings: MapSettings) -> NDArray[np.int8]:
-    """(H, W) int8 of UNKNOWN, FREE, OCCUPIED from (H, W) or (H, W, C) pixels, as map_io.cpp decides."""
+    """(H, W) int8 of UNKNOWN, FREE, OCCUPIED from (H, W) or (H, W, C) pixels, as map_io.cpp decides.
+
+    But for opacity in trinary mode: there map_io.cpp counts it as a fourth colour, which makes opaque unknown free.  Here, as
+    in scale mode, what is not opaque is unknown, and what is opaque reads as if nothing were said of it.
+    """
     depth = float(np.iinfo(pixels.dtype).max)
-    gray, alpha = _split(pixels, settings.mode)
+    gray, alpha = _split(pixels)
     shades = np.arange(depth + 1) / depth  # every shade there can be, looked up once instead of computed per pixel
     if settings.mode == "raw":
         percent = np.rint(shades * 255)
@@ -135,17 +141,17 @@ def cells_of(pixels: Pixels, settings: MapSettings) -> NDArray[np.int8]:
         )
         table = np.where(occupancy > high, OCCUPIED, np.where(occupancy < low, FREE, between))
     cells: NDArray[np.int8] = table.astype(np.int8)[gray]
-    if alpha is not None and settings.mode == "scale":
+    if alpha is not None and settings.mode != "raw":
         cells[alpha != depth] = UNKNOWN
     return cells
 
 
-def _split(pixels: Pixels, mode: str) -> tuple[Pixels, Pixels | None]:
-    """One shade a pixel, and the opacity when there is one; trinary counts opacity as a fourth colour, as nav2 does."""
+def _split(pixels: Pixels) -> tuple[Pixels, Pixels | None]:
+    """One shade a pixel, and the opacity when there is one."""
     if pixels.ndim == 2:
         return pixels, None
     has_alpha = pixels.shape[2] in (2, 4)
-    colours = pixels if mode == "trinary" else pixels[:, :, : pixels.shape[2] - has_alpha]
+    colours = pixels[:, :, : pixels.shape[2] - has_alpha]
     weights = np.full((1, colours.shape[2]), 1.0 / colours.shape[2], np.float32)
     gray = cv2.transform(np.ascontiguousarray(colours), weights)
     return gray.reshape(pixels.shape[:2]), pixels[:, :, -1] if has_alpha else None

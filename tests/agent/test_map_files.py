@@ -122,6 +122,12 @@ def test_another_gray_beside_it_makes_the_wide_threshold_meant(tmp_path: Path) -
     assert load_map(yaml).cells.tolist() == [[OCCUPIED, FREE, FREE]]
 
 
+def test_a_map_that_somebody_drew_on_keeps_its_unknown(tmp_path: Path) -> None:
+    row = bytes([0, 205, 254, 254, 205] * 20 + [255])  # a brush of white, at the end
+    yaml = written(tmp_path, WRITERS["nav2 map_saver, slam_toolbox"][1], b"P5 101 1 255\n" + row)
+    assert load_map(yaml).cells[0, :5].tolist() == [OCCUPIED, UNKNOWN, FREE, FREE, UNKNOWN]
+
+
 def test_images_of_every_depth_read_the_same(tmp_path: Path) -> None:
     shades = np.array([[0, 205, 254], [254, 0, 205]], np.uint8)
     gray16 = shades.astype(np.uint16) * 257
@@ -134,6 +140,7 @@ def test_images_of_every_depth_read_the_same(tmp_path: Path) -> None:
         "p5-127.pgm": b"P5 3 2 127\n" + np.rint(shades * (127 / 255)).astype(np.uint8).tobytes(),
         "gray.png": cv2.imencode(".png", shades)[1].tobytes(),
         "gray16.png": cv2.imencode(".png", gray16)[1].tobytes(),
+        "opaque.png": cv2.imencode(".png", opaque)[1].tobytes(),
         "colour.png": cv2.imencode(".png", opaque[:, :, :3])[1].tobytes(),
     }
     for name, data in images.items():
@@ -142,10 +149,11 @@ def test_images_of_every_depth_read_the_same(tmp_path: Path) -> None:
         assert load_map(yaml).cells.tolist() == [[FREE, OCCUPIED, UNKNOWN], [OCCUPIED, UNKNOWN, FREE]], name
 
 
-def test_a_transparent_pixel_is_unknown_in_scale_mode(tmp_path: Path) -> None:
+@pytest.mark.parametrize("mode", ["scale", "trinary"])
+def test_a_transparent_pixel_is_unknown(mode: str, tmp_path: Path) -> None:
     pixels = np.array([[[0, 0, 0, 255], [0, 0, 0, 0], [254, 254, 254, 255]]], np.uint8)
     (tmp_path / "a.png").write_bytes(cv2.imencode(".png", pixels)[1].tobytes())
-    yaml = written(tmp_path, YAML.replace("map.pgm", "a.png") + "mode: scale\n")
+    yaml = written(tmp_path, YAML.replace("map.pgm", "a.png") + f"mode: {mode}\n")
     assert load_map(yaml).cells.tolist() == [[OCCUPIED, UNKNOWN, FREE]]
 
 
