@@ -39,8 +39,9 @@ class Side:
     xy1: NDArray[np.float32]  # (3, P) the points it offers
     normals: NDArray[np.float32]  # (P, 2)
     field: MatchField
-    wall_xy: NDArray[np.float32]  # (N + 1, 2) all wall points; the last row is "none near"
-    wall_normals: NDArray[np.float32]  # (N + 1, 2), zero where too curved to pull
+    walls: NDArray[
+        np.float32
+    ]  # (4, N + 1) x, y and normal of all wall points, zero normals where too curved to pull; last: none near
 
     @staticmethod
     def of(thin: WallPoints, walls: WallPoints, field: MatchField, count: int) -> Side:
@@ -49,15 +50,10 @@ class Side:
             straight = straight[np.linspace(0, len(straight) - 1, count).astype(np.int64)]
         xy1 = np.ones((3, len(straight)), np.float32)
         xy1[:2] = thin.positions_m[straight].T
-        none = np.zeros((1, 2), np.float32)
         usable = (walls.linearity > MIN_LINEARITY)[:, None]
-        return Side(
-            xy1,
-            thin.normals[straight],
-            field,
-            np.concatenate([walls.positions_m, none]),
-            np.concatenate([walls.normals * usable, none]),
-        )
+        all_walls = np.zeros((4, len(walls) + 1), np.float32)
+        all_walls[:2, :-1], all_walls[2:, :-1] = walls.positions_m.T, (walls.normals * usable).T
+        return Side(xy1, thin.normals[straight], field, all_walls)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,9 +126,8 @@ def _partners(points: Side, lines: Side, poses: Poses) -> tuple[_Floats, ...]:
     columns, rows = placed(points.xy1, poses, lines.field.resolution_m)
     found = looked_up(lines.field.nearest, columns, rows, outside=-1)
     index = found.astype(np.int32)
-    q, n = lines.wall_xy[index], lines.wall_normals[index]
-    own = points.normals.T
-    return points.xy1[:1], points.xy1[1:2], q[..., 0], q[..., 1], n[..., 0], n[..., 1], own
+    qx, qy, nx, ny = (column.take(index) for column in lines.walls)
+    return points.xy1[:1], points.xy1[1:2], qx, qy, nx, ny, points.normals.T
 
 
 def _terms(
