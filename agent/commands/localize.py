@@ -17,6 +17,7 @@ from agent.commands.files import loaded_map, written_file
 from agent.commands.merge_files import LoadedMap, Merged, pair_picture
 from agent.exits import NEGATIVE, OK, PEER, CommandError
 from agent.features.snapshot import MapSnapshot
+from agent.merging.arrays import without_canvas
 from agent.merging.localization import localize
 from agent.merging.result import MatchOptions, MergeResult
 from agent.running import ask_robot, robot_socket
@@ -49,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
         local, T_local_robot, name = loaded_map(args.local), None, args.local.name
     else:
         local, T_local_robot, name = running_map(args.robot)
-    result = localize(MapSnapshot.of(local), MapSnapshot.of(given))
+    result = localize(MapSnapshot.of(without_canvas(local)), MapSnapshot.of(without_canvas(given)))
     if args.output is not None:
         picture = _picture(LoadedMap(str(args.given), given), LoadedMap(name, local), result)
         written_file(args.output, picture)

@@ -21,7 +21,7 @@ from agent.features.snapshot import MapSnapshot
 from agent.files import write_atomically
 from agent.fleet.frame_graph import Edge, solve
 from agent.map_files import save_map
-from agent.merging.arrays import at_corner
+from agent.merging.arrays import at_corner, without_canvas
 from agent.merging.errors import FusionError
 from agent.merging.fusion import FusedMap, fuse
 from agent.merging.matched_features import matched_features
@@ -46,7 +46,7 @@ class LoadedMap:
 
     @cached_property
     def snapshot(self) -> MapSnapshot:
-        return MapSnapshot.of(at_corner(self.grid))
+        return MapSnapshot.of(without_canvas(at_corner(self.grid)))
 
 
 @dataclass(eq=False)

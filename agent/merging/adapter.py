@@ -5,18 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.features.snapshot import MapSnapshot
-from agent.merging.matching import match_maps
+from agent.merging.arrays import merge_arrays
 from agent.merging.result import MatchOptions
-from protocol.grid import OccupancyGrid
 
 
 def merge(
     map_a: NDArray[np.int8], map_b: NDArray[np.int8], resolution: float, method: str = "hybrid"
 ) -> tuple[bool, tuple[float, float, float] | None, float]:
     """(accepted, (x, y, theta) of b's frame in a's, score); int8 maps as in nav_msgs, row 0 the lowest y."""
-    ours, theirs = (MapSnapshot.of(OccupancyGrid(cells, resolution)) for cells in (map_a, map_b))
-    result = match_maps(ours, theirs, MatchOptions(method=method))
+    result = merge_arrays(map_a, map_b, resolution, options=MatchOptions(method=method))
     T = result.T_ours_theirs
     return result.accepted, None if T is None else (T.x_m, T.y_m, T.theta_rad), result.score - result.runner_up_score
 

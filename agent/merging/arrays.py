@@ -29,6 +29,7 @@ from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 OCCUPIED_FROM = 65  # nav2's thresholds for values between 0 and 100
 FREE_UP_TO = 25
+CANVAS_MARGIN_CELLS = 2
 
 
 def merge_arrays(
@@ -41,7 +42,7 @@ def merge_arrays(
     """Find the transform that lays map b on map a, in metres and radians; `resolution_b_m` when b's cells are of another size."""
     ours = grid_from_array(map_a, resolution_m, "map a")
     theirs = grid_from_array(map_b, resolution_m if resolution_b_m is None else resolution_b_m, "map b")
-    return match_maps(MapSnapshot.of(ours), MapSnapshot.of(theirs), options)
+    return match_maps(MapSnapshot.of(without_canvas(ours)), MapSnapshot.of(without_canvas(theirs)), options)
 
 
 def fuse_arrays(
@@ -70,6 +71,12 @@ def _trinary(array: NDArray[np.integer]) -> NDArray[np.int8]:
     cells[(array >= 0) & (array <= FREE_UP_TO)] = FREE
     cells[array >= OCCUPIED_FROM] = OCCUPIED
     return cells
+
+
+def without_canvas(grid: OccupancyGrid) -> OccupancyGrid:
+    """The same map without the unknown around it when that is most of it: some save a building on 4000 x 4000 cells."""
+    known = grid.cropped(CANVAS_MARGIN_CELLS)
+    return known if 2 * known.cells.size < grid.cells.size else grid
 
 
 def at_corner(grid: OccupancyGrid) -> OccupancyGrid:

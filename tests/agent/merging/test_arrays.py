@@ -28,6 +28,16 @@ def test_two_arrays_come_together_corner_to_corner():
     assert fused.grid.known_area_m2() == pytest.approx(plan.width_m * plan.height_m, rel=0.05)
 
 
+def test_a_small_map_on_a_large_canvas_is_the_same_map():
+    plan = office(2)
+    a, b = plan.mapped(SE2(0, 0, 0.3), 0.1, (-1, 18.0)).cells, plan.mapped(SE2(0, 0, 1.1), 0.1, (9.0, 1e3)).cells
+    canvas = np.full((1500, 2000), -1, np.int8)
+    canvas[40 : 40 + b.shape[0], 1000 : 1000 + b.shape[1]] = b
+    alone, on_canvas = (merge_arrays(a, theirs, 0.1) for theirs in (b, canvas))
+    assert on_canvas.accepted
+    assert alone.T_ours_theirs.distance_m(on_canvas.T_ours_theirs @ SE2(100.0, 4.0, 0.0)) < 0.01
+
+
 def test_probabilities_between_are_read_with_nav2s_thresholds():
     cells = np.array([[0, 25, 26], [64, 65, 100], [-1, -1, -1]])
     fused = fuse_arrays(cells, cells, 0.1, SE2.identity())
