@@ -9,13 +9,14 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
-from hw.framing import ByteWindow, Counters, SizedFrames
+from hw.framing import Bytes, ByteWindow, Counters, SizedFrames
 from hw.odometry import Quiet, TickSample, WheelGeometry
 from hw.rplidar_wire import xor8
 
 BAUD_RATES = (115200,)
 HEADER = b"\xaa\x55"
 CORE, BASE_CONTROL, REQUEST_EXTRA = 1, 1, 9
+MOST_BYTES = 259
 CLOCK_PERIOD_S = 65.536
 GEOMETRY = WheelGeometry(0.000085292090, 0.230, max_speed_mps=1.0)  # 0.0024369169 rad a tick, wheels of 35 mm
 
@@ -68,6 +69,16 @@ def decode(frame: bytes) -> dict[int, bytes] | None:
     return parts if at == end else None
 
 
+def frames() -> SizedFrames:
+    """Finds whole frames, which look the same in both directions."""
+    return SizedFrames(HEADER, 3, MOST_BYTES, lambda data: data[2] + 4, lambda frame: decode(frame) is not None)
+
+
+def unpadded(row: Bytes) -> bytes:
+    """The frame in a row of those that were found."""
+    return row[: int(row[2]) + 4].tobytes()
+
+
 def base_control(speed_mm_s: int, radius_mm: int) -> bytes:
     """The command to drive; mapquilt only reads, a simulator understands it."""
     return encode(struct.pack("<BBhh", BASE_CONTROL, 4, speed_mm_s, radius_mm))
@@ -87,14 +98,14 @@ class Kobuki(Quiet):
         self.geometry = geometry or GEOMETRY
         self.counters = Counters()
         self._window = ByteWindow(self.counters, 4096)
-        self._frames = SizedFrames(HEADER, 3, 259, lambda data: data[2] + 4, lambda frame: decode(frame) is not None)
+        self._frames = frames()
 
     def feed(self, data: bytes) -> list[TickSample]:
         """See `BaseProtocol`."""
         self._window.push(data)
         samples = []
         for row in self._frames.take(self._window, self.counters).data:
-            parts = decode(row[: int(row[2]) + 4].tobytes()) or {}
+            parts = decode(unpadded(row)) or {}
             core = Core.decode(parts.get(CORE, b""))
             if core is not None:
                 samples.append(TickSample(core.left_ticks, core.right_ticks, 16, core.clock_ms / 1e3, CLOCK_PERIOD_S))

@@ -22,6 +22,8 @@ SCAN_LENGTHS = {NODE_TYPE: 5, EXPRESS_TYPE: 84, HQ_TYPE: 781, ULTRA_TYPE: 132, D
 
 CONF_MODE_COUNT, CONF_SAMPLE_US, CONF_MAX_DISTANCE = 0x70, 0x71, 0x74
 CONF_ANSWER_TYPE, CONF_TYPICAL_MODE, CONF_MODE_NAME = 0x75, 0x7C, 0x7F
+CONF_OF_MODES = (CONF_SAMPLE_US, CONF_MAX_DISTANCE, CONF_ANSWER_TYPE, CONF_MODE_NAME)
+CONF_SPEED, CONF_SLOWEST, CONF_FASTEST, CONF_MODEL_NAME = 0x01, 0x04, 0x05, 0x81
 MAX_ANSWER_BYTES = 256
 
 
@@ -159,21 +161,6 @@ class Health:
     @staticmethod
     def decode(data: bytes) -> Health | None:
         return Health(*struct.unpack("<BH", data)) if len(data) == 3 else None
-
-
-@dataclass(frozen=True, slots=True)
-class SampleRate:
-    """GET_SAMPLERATE: microseconds a sample in standard and express mode."""
-
-    standard_us: int
-    express_us: int
-
-    def encode(self) -> bytes:
-        return struct.pack("<HH", self.standard_us, self.express_us)
-
-    @staticmethod
-    def decode(data: bytes) -> SampleRate | None:
-        return SampleRate(*struct.unpack("<HH", data)) if len(data) == 4 else None
 
 
 @dataclass(frozen=True, slots=True)

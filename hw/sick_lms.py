@@ -27,7 +27,8 @@ ACKS = (bytes((ACK,)), bytes((NAK,)))
 HOST_ADDRESS, SCANNER_ADDRESS = 0x00, 0x80
 MOST_PAYLOAD = 812
 STATUS, TYPE, RESET, MODE, VARIANT = b"\x31", b"\x3a", b"\x10", 0x20, 0x3B
-CONTINUOUS, POLLED = bytes((MODE, 0x24)), bytes((MODE, 0x25))
+CONTINUOUS, POLLED, PARTIAL = bytes((MODE, 0x24)), bytes((MODE, 0x25)), bytes((MODE, 0x2A))
+ONE_SCAN, GET_CONFIG, SET_CONFIG, ERRORS = b"\x30\x01", 0x74, 0x77, b"\x32"
 RATE_CODES = {9600: 0x42, 19200: 0x41, 38400: 0x40, 500000: 0x48}
 INSTALL = bytes((MODE, 0x00)) + b"SICK_LMS"
 FIELDS = {
@@ -80,9 +81,10 @@ class ScanPayload:
     values: tuple[int, ...]
     is_mm: bool = False
     status: int = 0x10
+    partial: int | None = None  # one turn of the mirror in steps of a degree, begun so many quarter degrees later
 
     def encode(self) -> bytes:
-        info = len(self.values) | (0x4000 if self.is_mm else 0)
+        info = len(self.values) | (0x4000 if self.is_mm else 0) | (0 if self.partial is None else 0x2000 | self.partial << 11)
         return struct.pack(f"<BH{len(self.values)}HB", 0xB0, info, *self.values, self.status)
 
     @staticmethod

@@ -17,8 +17,9 @@ from hw.sim.bases_sim import Counter
 from hw.sim.catalogue import BASES, LIDARS, NAMES, USUAL, device_url
 from hw.sim.devices import ByteDevice
 from hw.sim.faults import KINDS, RATES, FaultyDevice, Schedule
+from hw.sim.obedient import ObedientRobot
 from hw.sim.robot import DriveOptions, SimulatedRobot
-from hw.sim.sight import PoseSource, Sight, Standing
+from hw.sim.sight import PoseSource, Sight
 from hw.sim.sim_port import PtyServer
 from hw.sim.world import World, open_world
 from protocol.geometry import SE2
@@ -52,7 +53,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--noise", metavar="METRES", type=float, default=0.01, help="one sigma of a range; 0: exact (default 0.01)"
     )
-    parser.add_argument("--explore", action="store_true", help="the robot drives around by itself, not into walls")
+    parser.add_argument(
+        "--explore", action="store_true", help="the robot drives around by itself, not into walls (else: as its base is told)"
+    )
     parser.add_argument(
         "--speed", metavar="M/S", type=float, default=USUAL.speed_mps, help="of the exploring robot (default %(default)s)"
     )
@@ -126,18 +129,10 @@ def _pose(text: str) -> SE2:
 def _base(args: argparse.Namespace, world: World, pose: SE2, drive: DriveOptions) -> PoseSource:
     """What the devices sit on."""
     if not args.explore:
-        return _Parked(world, pose)
+        return ObedientRobot(world, pose, drive)
     robot = SimulatedRobot(world, pose, args.seed, replace(drive, speed_mps=args.speed))
     robot.begin()
     return robot
-
-
-class _Parked(Standing):
-    """Wheels that never turn."""
-
-    def ticks_at(self, time_s: float) -> tuple[int, int]:
-        """See `Counter`."""
-        return 0, 0
 
 
 def _device(name: str, base: PoseSource, args: argparse.Namespace) -> ByteDevice:

@@ -8,16 +8,20 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from hw import create2, kobuki, wheels, xv11
-from hw.sim.bases_sim import ArduinoBridgeSim, Counter, Counting, KobukiSim, RoboClawSim, Wt1Ticks
+from hw.sim.arduino_sim import ArduinoBridgeSim
+from hw.sim.bases_sim import Counter, Counting, Wt1Ticks
 from hw.sim.create2_sim import Create2Sim
 from hw.sim.devices import ByteDevice, Wt1Board
 from hw.sim.hokuyo_sim import MODELS as HOKUYOS
 from hw.sim.hokuyo_sim import HokuyoSim
+from hw.sim.kobuki_sim import KobukiSim
+from hw.sim.roboclaw_sim import RoboClawSim
 from hw.sim.robot import DriveOptions
 from hw.sim.rplidar_sim import UNITS, RplidarSim
 from hw.sim.sick_sim import SickSim
 from hw.sim.sight import Sight
-from hw.sim.spinning_sim import YDLIDARS, LdrobotSim, NeatoSim, YdlidarSim
+from hw.sim.spinning_sim import LdrobotSim, NeatoSim
+from hw.sim.ydlidar_sim import YDLIDARS, YdlidarSim
 
 USUAL = DriveOptions()
 

@@ -1,12 +1,14 @@
 """A simulated iRobot Create 2: its Open Interface as far as a host can tell it from the real one (SERIAL.md 7.1).
 
 Every command is understood by its length, every sensor packet and group has its size and a plausible value; the wheel
-counters are those of whatever turns the wheels.  It starts in the off mode, as after power-up, and hears only START and RESET.
+counters are those of whatever turns the wheels.  It starts in the off mode, as after power-up, and hears only START and RESET;
+in the safe and full modes it drives as it is told.
 """
 
 from __future__ import annotations
 
 import math
+import struct
 
 from hw import create2
 from hw.sim.bases_sim import Counting, Streaming
@@ -17,6 +19,8 @@ _RESET, _QUERY, _QUERY_LIST, _SONG = 7, 142, 149, 140
 _LENGTHS = {129: 2, 137: 5, 138: 2, 139: 4, 141: 2, 142: 2, 144: 4, 145: 5, 146: 5, 150: 2, 162: 3, 163: 5, 164: 5, 165: 2}
 _LENGTHS |= {167: 16, 168: 4}  # of a command with its operands; those not here are one byte long
 _VALUES = {22: 15000, 23: -250, 24: 25, 25: 2500, 26: 2696, 34: 0, 58: 2}  # mV, mA, degrees, mAh, mAh, sources, stasis
+_DRIVE, _DRIVE_DIRECT, _DRIVE_PWM = 137, 145, 146
+_FULL_MM_S = 500.0  # at a PWM of 255
 ANSWER_S = 0.004  # a host may clear its input right after it has asked, as the real robot is not that quick
 _BOOT = ((0.0, b"Soft reset!\n"), (1.0, b"\xfe"), (3.0, b"Roomba by iRobot!\r\nstm32\r\n"))  # seconds after RESET
 
@@ -28,7 +32,6 @@ class Create2Sim(Streaming):
 
     def __init__(self, counting: Counting) -> None:
         super().__init__(counting, 0.015)
-        self._inbox = bytearray()
         self._mode = OFF
         self._stream: list[int] = []
         self._is_streaming = False
@@ -56,6 +59,8 @@ class Create2Sim(Streaming):
     def _obey(self, command: bytes, now_s: float) -> None:
         code = command[0]
         self._mode = _MODES.get(code, self._mode)
+        if code in _MODES and self._mode in (OFF, PASSIVE):
+            self._drive(0, 0, now_s)
         if code == create2.STREAM:
             self._stream, self._is_streaming = [p for p in command[2:] if p in create2.SIZES], True
         elif code == create2.PAUSE_STREAM:
@@ -65,10 +70,18 @@ class Create2Sim(Streaming):
             self._said.append((now_s + ANSWER_S, self._answer(asked, now_s)))
         elif code == _RESET:
             self._mode, self._is_streaming = OFF, False
+            self._drive(0, 0, now_s)
             self._said = [(now_s + later_s, text) for later_s, text in _BOOT]
             self._booted_s = self._said[-1][0]
         elif code == 173:
             self._is_streaming = False
+        elif code in (_DRIVE, _DRIVE_DIRECT, _DRIVE_PWM) and self._mode in (SAFE, FULL):
+            first, second = struct.unpack(">hh", command[1:])
+            self._drive(*_wheels_mm_s(code, first, second), now_s)
+
+    def _drive(self, left_mm_s: float, right_mm_s: float, now_s: float) -> None:
+        ticks_per_mm = 1e-3 / create2.METRES_PER_TICK
+        self.counting.turn_wheels(left_mm_s * ticks_per_mm, right_mm_s * ticks_per_mm, now_s)
 
     def _answer(self, asked: bytes, now_s: float) -> bytes:
         packets = [p for a in asked for p in create2.GROUPS.get(a, (a,)) if p in create2.SIZES]
@@ -88,3 +101,17 @@ class Create2Sim(Streaming):
             if self._is_streaming and self._stream:
                 out += create2.encode_stream(self._values(time_s, self._stream))
         return bytes(out)
+
+
+def _wheels_mm_s(code: int, first: int, second: int) -> tuple[float, float]:
+    """Left and right, of the operands of a command to drive."""
+    if code == _DRIVE_DIRECT:
+        return second, first
+    if code == _DRIVE_PWM:
+        return second * _FULL_MM_S / 255, first * _FULL_MM_S / 255
+    if second in (-32768, 32767, 0):
+        return first, first
+    if abs(second) == 1:
+        return -first * second, first * second
+    half_mm = 1e3 * create2.TRACK_M / 2
+    return first * (1 - half_mm / second), first * (1 + half_mm / second)

@@ -116,7 +116,7 @@ class SickScanner:
             return b"\xa0\x00\x10"
         if payload[0] == sick_lms.VARIANT:
             return b"\xbb\x01" + payload[1:] + b"\x10"
-        body = b"LMS291-S05;V02.10" if payload == sick_lms.TYPE else b""
+        body = b"LMS291;S05;V02.10" if payload == sick_lms.TYPE else b""
         return bytes((payload[0] | 0x80,)) + body + b"\x10"
 
     def emit(self, now_s: float) -> bytes:

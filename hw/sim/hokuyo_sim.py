@@ -14,6 +14,7 @@ from hw.sim.sight import Part, Sight, Turntable
 MODELS = {"hokuyo-urg": scip.URG_04LX, "hokuyo-utm": scip.UTM_30LX}
 _SCAN = re.compile(rb"([MG])([DSE])(\d{4})(\d{4})(\d{2})(?:(\d)(\d{2}))?$")
 _REFUSED = b"10"
+BOOT_S = 1.0
 _TIME_STATUS = {(b"TM0", True): b"02", (b"TM1", False): b"04", (b"TM2", False): b"03"}  # (command, is the clock being read): no
 
 
@@ -34,7 +35,7 @@ class HokuyoSim:
         self._once: list[bytes] = []  # GD requests waiting for the next sweep
         self._is_laser_on = False
         self._is_timing = False
-        self._booting_until_s = -math.inf
+        self._booting_until_s = self._asked_to_reboot_s = -math.inf
         self._clock_offset_s = 0.0
 
     def fault(self, kind: str, value: float, now_s: float) -> None:
@@ -75,6 +76,8 @@ class HokuyoSim:
             self._once.clear()
             self._next_baud = self._first_baud if command == b"RS" else self.baud
             self._say(line)
+        elif command == b"RB":
+            self._reboot(line, now_s)
         elif command in (b"TM0", b"TM1", b"TM2"):
             self._time(line, command, now_s)
         elif command == b"%ST":
@@ -85,6 +88,15 @@ class HokuyoSim:
             self._say(line)
         else:
             self._say(line, b"0E")
+
+    def _reboot(self, line: bytes, now_s: float) -> None:
+        """Said twice within a second it is meant."""
+        is_meant = now_s - self._asked_to_reboot_s < 1.0
+        self._asked_to_reboot_s = -math.inf if is_meant else now_s
+        self._say(line, b"00" if is_meant else b"01")
+        if is_meant:
+            self.fault("booting", BOOT_S, now_s)
+            self._next_baud = self._first_baud
 
     def _state(self, now_s: float) -> list[bytes]:
         """What II tells."""

@@ -135,8 +135,9 @@ class RplidarSim:
             self._outbox += wire.answer(wire.INFO_TYPE, self.unit.info.encode())
         elif command == wire.HEALTH_CMD:
             self._outbox += wire.answer(wire.HEALTH_TYPE, self.health.encode())
-        elif command == 0x59:
-            self._outbox += wire.answer(wire.SAMPLERATE_TYPE, wire.SampleRate(*self._sample_us()).encode())
+        elif command == wire.SAMPLERATE_CMD:
+            periods_us = (round(1e6 / mode.samples_per_s) for mode in self.unit.modes[:2])  # standard, express
+            self._outbox += wire.answer(wire.SAMPLERATE_TYPE, struct.pack("<HH", *periods_us))
         elif command == wire.BOARD_FLAG_CMD:
             self._outbox += wire.answer(wire.BOARD_FLAG_TYPE, struct.pack("<I", 0))
         elif command == wire.GET_CONF_CMD and len(payload) >= 4:
@@ -152,18 +153,20 @@ class RplidarSim:
         self._booted_s = now_s + BOOT_S
         self._outbox += BANNER
 
-    def _sample_us(self) -> tuple[int, int]:
-        return tuple(round(1e6 / self.unit.modes[k].samples_per_s) for k in (0, 1))  # type: ignore[return-value]
-
     def _tell(self, key: int, mode: int) -> None:
         modes = self.unit.modes
-        if key in (0x71, 0x74, wire.CONF_ANSWER_TYPE, wire.CONF_MODE_NAME) and mode >= len(modes):
+        if key in wire.CONF_OF_MODES and mode >= len(modes):
             return
+        rpm = round(60 * self.unit.turn_hz)
         value = {
+            wire.CONF_SPEED: lambda: struct.pack("<HH", rpm, 660),
+            wire.CONF_SLOWEST: lambda: struct.pack("<H", rpm // 2),
+            wire.CONF_FASTEST: lambda: struct.pack("<H", 2 * rpm),
+            wire.CONF_MODEL_NAME: lambda: self.unit.info.name.encode() + b"\0",
             wire.CONF_MODE_COUNT: lambda: struct.pack("<H", len(modes)),
             wire.CONF_TYPICAL_MODE: lambda: struct.pack("<H", self.unit.typical),
-            0x71: lambda: struct.pack("<I", round(256e6 / modes[mode].samples_per_s)),
-            0x74: lambda: struct.pack("<I", round(256 * self.unit.range_max_m)),
+            wire.CONF_SAMPLE_US: lambda: struct.pack("<I", round(256e6 / modes[mode].samples_per_s)),
+            wire.CONF_MAX_DISTANCE: lambda: struct.pack("<I", round(256 * self.unit.range_max_m)),
             wire.CONF_ANSWER_TYPE: lambda: bytes((modes[mode].type,)),
             wire.CONF_MODE_NAME: lambda: modes[mode].name.encode() + b"\0",
         }.get(key)

@@ -1,6 +1,10 @@
-"""A simulated SICK LMS291."""
+"""A simulated SICK LMS291, as far as its hosts ask: status, type, configuration, variants, and scans streamed, polled or in parts
+(SERIAL.md 5).
+"""
 
 from __future__ import annotations
+
+import struct
 
 import numpy as np
 
@@ -8,30 +12,77 @@ from hw import sick_lms
 from hw.sim.devices import SickScanner
 from hw.sim.sight import Sight
 
+VERSION = b"V02.10 "
+OK, FAILED = b"\xa0\x00\x10", b"\xa0\x02\x10"
+INSTALLATION = 0x00
+WAYS = (sick_lms.CONTINUOUS[1], sick_lms.POLLED[1], sick_lms.PARTIAL[1])  # of sending scans
+UNIT_AT, MEASURING_MODE_AT = 6, 5  # in the configuration
+RANGE_32_M, RANGE_8_OR_80_M = 6, 0  # measuring modes: in millimetres the second reaches 8 metres
+CONFIG = bytes((0, 0, 70, 0, 0, RANGE_32_M, 1)) + bytes(27)
+STATUS_BYTES = 152
+
 
 class SickSim(SickScanner):
-    """A SICK LMS291 that wakes at 9600 baud, in centimetres or millimetres, 180 or 100 degrees."""
+    """Wakes at 9600 baud, half a degree over 180, in millimetres."""
 
     def __init__(self, sight: Sight) -> None:
         super().__init__(_Nothing())
         self.baud = 9600
         self._sight = sight
-        self._field_deg, self._step_deg, self._is_mm = 180.0, 0.5, True
+        self._field_deg, self._step_deg = 180, 0.5
+        self._config = CONFIG
+        self._mode = sick_lms.POLLED[1]
+        self._turn = 0  # of the mirror, while scans are sent in parts
+        self._now_s = 0.0
         self._next_s: float | None = None
 
     def _answer(self, payload: bytes) -> bytes:
+        if payload[0] == sick_lms.MODE and len(payload) > 1:
+            return self._change_mode(payload)
         if payload[0] == sick_lms.VARIANT and len(payload) == 5:
-            self._field_deg, self._step_deg = float(payload[1]), (payload[3] | payload[4] << 8) / 100.0
-        if payload[0] == 0x74:
-            return b"\xf4" + self._config() + b"\x10"
-        if payload[0] == 0x77 and len(payload) > 7:
-            self._is_mm = payload[7] == 1
-            return b"\xf7\x01" + payload[1:] + b"\x10"
+            self._field_deg, self._step_deg = payload[1] | payload[2] << 8, (payload[3] | payload[4] << 8) / 100.0
+        if payload == sick_lms.ONE_SCAN:
+            return self._scan(0.0, self._step_deg, self._now_s, None)
+        if payload == sick_lms.STATUS:
+            return b"\xb1" + self._status() + b"\x10"
+        if payload[0] == sick_lms.GET_CONFIG:
+            return b"\xf4" + self._config + b"\x10"
+        if payload[0] == sick_lms.SET_CONFIG:
+            is_taken = self._mode == INSTALLATION and len(payload) > UNIT_AT + 1
+            self._config = payload[1:].ljust(len(CONFIG), b"\0")[: len(CONFIG)] if is_taken else self._config
+            return b"\xf7" + bytes((is_taken,)) + self._config + b"\x10"
         return super()._answer(payload)
 
-    def _config(self) -> bytes:
-        """The 32 bytes of the configuration; the sixth is the measuring mode, the seventh the unit."""
-        return bytes((0, 0, 70, 0, 0, 6 if self._is_mm else 0, 1 if self._is_mm else 0)) + bytes(25)
+    def _change_mode(self, payload: bytes) -> bytes:
+        """To a baud rate, to a way of sending scans, or to be set up, which takes a password."""
+        if payload[1] in sick_lms.RATE_CODES.values():
+            return super()._answer(payload)
+        if payload[1] == INSTALLATION:
+            is_known = payload == sick_lms.INSTALL
+            self._mode, self._is_sending = (INSTALLATION, False) if is_known else (self._mode, self._is_sending)
+            return OK if is_known else b"\xa0\x01\x10"
+        if payload[1] not in WAYS:
+            return FAILED
+        self._mode, self._turn = payload[1], 0
+        self._is_sending = payload != sick_lms.POLLED
+        return OK
+
+    def _status(self) -> bytes:
+        """What is told of it, at the places the manual gives, counted behind the B1."""
+        told = bytearray(STATUS_BYTES)
+        told[0:7] = VERSION
+        told[7] = self._mode
+        struct.pack_into("<H", told, 66, 4500)  # turns of the mirror a minute
+        told[101] = self._config[MEASURING_MODE_AT]
+        struct.pack_into("<HH", told, 106, self._field_deg, round(100 * self._step_deg))
+        told[121], told[122] = self._config[UNIT_AT], 1  # unit, laser
+        told[123:130] = VERSION
+        return bytes(told)
+
+    def receive(self, data: bytes, now_s: float) -> None:
+        """See `ByteDevice`."""
+        self._now_s = now_s
+        super().receive(data, now_s)
 
     def emit(self, now_s: float) -> bytes:
         """See `ByteDevice`: as many scans as the line carries."""
@@ -39,23 +90,35 @@ class SickSim(SickScanner):
         if not self._is_sending:
             self._next_s = None
             return out
-        n = round(self._field_deg / self._step_deg) + 1
-        period_s = max(sick_lms.MIRROR_S / self._step_deg, (10 + 2 * n) * 10.0 / self.baud)
+        is_partial = self._mode == sick_lms.PARTIAL[1]
+        step_deg = 1.0 if is_partial else self._step_deg
+        line_s = (10 + 2 * (self._field_deg / step_deg + 1)) * 10.0 / self.baud
+        period_s = max(sick_lms.MIRROR_S / step_deg, line_s)
         if self._next_s is None or now_s - self._next_s > 0.5:
             self._next_s = now_s + period_s
         while self._next_s <= now_s:
-            out += self._telegram(n, self._next_s - (10 + 2 * n) * 10.0 / self.baud)
+            end_s = self._next_s - line_s
+            scan = self._part(end_s) if is_partial else self._scan(0.0, step_deg, end_s, None)
+            out += sick_lms.encode(scan, sick_lms.SCANNER_ADDRESS)
             self._next_s += period_s
         return out
 
-    def _telegram(self, n: int, end_s: float) -> bytes:
-        duration_s = sick_lms.MIRROR_S / self._step_deg * self._field_deg / 360.0
-        angles_rad = np.radians(np.arange(n) * self._step_deg - self._field_deg / 2)
-        times_s = np.linspace(end_s - duration_s, end_s, n)
-        far_m, nothing, scale = (32.0, 0x7FFF, 1e3) if self._is_mm else (80.0, 0x1FFF, 1e2)
-        ranges_m = self._sight.ranges_m(times_s, angles_rad, 0.05, far_m)
+    def _part(self, end_s: float) -> bytes:
+        """One turn of the mirror, degree by degree; the next begins a step further."""
+        parts = max(1, round(1.0 / self._step_deg))
+        first_deg, self._turn = self._turn % parts * self._step_deg, self._turn + 1
+        return self._scan(first_deg, 1.0, end_s, round(first_deg / 0.25))
+
+    def _scan(self, first_deg: float, step_deg: float, end_s: float, partial: int | None) -> bytes:
+        duration_s = sick_lms.MIRROR_S / step_deg * self._field_deg / 360.0
+        angles_deg = np.arange(first_deg, self._field_deg + 1e-6, step_deg) - self._field_deg / 2
+        times_s = np.linspace(end_s - duration_s, end_s, len(angles_deg))
+        is_mm = self._config[UNIT_AT] == 1
+        is_32_m = self._config[MEASURING_MODE_AT] == RANGE_32_M
+        nothing, scale = (0x7FFF if is_32_m else 0x1FFF), (1e3 if is_mm else 1e2)
+        ranges_m = self._sight.ranges_m(times_s, np.radians(angles_deg), 0.05, min(80.0, (nothing - 9) / scale))
         values = np.where(np.isfinite(ranges_m), np.rint(np.where(np.isfinite(ranges_m), ranges_m, 0) * scale), nothing)
-        return sick_lms.scan_telegram([int(v) for v in values], self._is_mm)
+        return sick_lms.ScanPayload(tuple(int(v) for v in values), is_mm, partial=partial).encode()
 
 
 class _Nothing:

@@ -31,7 +31,6 @@ PLAIN = (  # total functions from one frame's bytes to a value or None
     rplidar_wire.Descriptor.decode,
     rplidar_wire.Info.decode,
     rplidar_wire.Health.decode,
-    rplidar_wire.SampleRate.decode,
     rplidar_wire.Conf.decode,
     rplidar_wire.parse_request,
     xv11.decode_xv11,

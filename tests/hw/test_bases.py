@@ -74,7 +74,10 @@ FRAMES: dict[str, tuple[Callable[[], BaseProtocol], Callable[[int, int], bytes]]
     ),
     "create2": (create2.Create2, lambda left, right: create2.encode_stream({43: left, 44: right})),
     "kobuki": (kobuki.Kobuki, lambda left, right: kobuki.encode(kobuki.Core(7, left, right).encode())),
-    "arduino": (lambda: arduino_bridge.ArduinoBridge(GEOMETRY), arduino_bridge.encode_counts),
+    "arduino": (
+        lambda: arduino_bridge.ArduinoBridge(GEOMETRY),
+        lambda left, right: arduino_bridge.LINES_TO_JUMP * arduino_bridge.encode_counts(left, right),
+    ),
     "roboclaw": (lambda: roboclaw.RoboClaw(GEOMETRY), lambda left, right: roboclaw.encode_counts(0x80, left, right)),
 }
 COUNTS = [(1, 2), (19, 275), (43, 44), (0x13, 0xAA55), (1000, 60000)]
@@ -124,6 +127,30 @@ def test_a_flipped_bit_is_never_a_sample(base: str) -> None:
 ])  # fmt: skip
 def test_counters_wrap_the_short_way(before: int, after: int, bits: int, delta: int) -> None:
     assert tick_delta(before, after, bits) == delta
+
+
+def told(*lines: tuple[int, int]) -> list[tuple[int, int]]:
+    """What an arduino bridge makes of these lines, some of them wrong."""
+    base = arduino_bridge.ArduinoBridge(GEOMETRY)  # 15 ms are 10 ticks, 50 ms 50
+    return ticks(base.feed(b"".join(arduino_bridge.encode_counts(*line) for line in lines)))
+
+
+def test_a_line_without_a_checksum_counts_when_it_was_told_twice() -> None:
+    start = 4 * [(1000, 2000)]
+    assert told(*start, (1030, 2030), (1031, 2031)) == [(1000, 2000), (1031, 2031)]
+    assert told(*start, (1020, 2020), (1021, 221), (1040, 2040), (1041, 2041)) == [(1000, 2000), (1041, 2041)], "a digit lost"
+    assert told(*start, (100, 2000), (100, 2000), (1040, 2040), (1041, 2041)) == [(1000, 2000), (1041, 2041)], "from both lines"
+
+
+def test_counters_of_an_arduino_that_restart_or_jump_are_believed_when_they_stay() -> None:
+    base = arduino_bridge.ArduinoBridge(GEOMETRY)
+    lines = [*[(1000, 2000)] * 4, *[(3, 5)] * 4, *[(9000, 9000)] * 4]
+    samples = base.feed(b"".join(arduino_bridge.encode_counts(*line) for line in lines))
+    assert [(*pair, s.is_reset) for pair, s in zip(ticks(samples), samples, strict=True)] == [
+        (1000, 2000, False),
+        (3, 5, True),
+        (9000, 9000, False),
+    ]
 
 
 def test_an_arc_is_exact() -> None:

@@ -1,24 +1,24 @@
-"""Simulated devices answer what other people's programs ask, not only what our own drivers do."""
+"""Simulated LIDARs answer what other people's programs ask, not only what our own drivers do."""
 
 from __future__ import annotations
 
 import struct
 
+import numpy as np
 import pytest
 
-from hw import create2, roboclaw, ydlidar_wire
-from hw.sim.bases_sim import Counting, RoboClawSim
-from hw.sim.create2_sim import Create2Sim
+from hw import rplidar_wire, scip, sick_lms, ydlidar_wire
+from hw.sim.catalogue import HOKUYOS
+from hw.sim.hokuyo_sim import HokuyoSim
+from hw.sim.rplidar_sim import RplidarSim
+from hw.sim.sick_sim import SickSim
 from hw.sim.sight import Sight, Standing
-from hw.sim.spinning_sim import YdlidarSim
+from hw.sim.ydlidar_sim import YdlidarSim
 from tests.harness.serial_device import POSE, ROOM
 
 
-class Turned:
-    """Wheels that have turned so far."""
-
-    def ticks_at(self, time_s: float) -> tuple[int, int]:
-        return -100, 70000
+def sight() -> Sight:
+    return Sight(Standing(ROOM, POSE), noise_m=0.0)
 
 
 def answer(device: object, request: bytes, seconds: float = 0.1) -> bytes:
@@ -26,59 +26,86 @@ def answer(device: object, request: bytes, seconds: float = 0.1) -> bytes:
     return device.emit(5.0) + device.emit(5.0 + seconds)  # type: ignore[attr-defined]
 
 
-@pytest.fixture
-def robot() -> Create2Sim:
-    robot = Create2Sim(Counting(Turned()))
-    robot.receive(bytes((create2.START, create2.SAFE)), 4.0)
-    return robot
-
-
-GROUP_BYTES = {0: 26, 1: 10, 2: 6, 3: 10, 4: 14, 5: 12, 6: 52, 100: 80, 101: 28, 106: 12, 107: 9}
-
-
-@pytest.mark.parametrize(("group", "size"), GROUP_BYTES.items())
-def test_every_group_of_a_create2_has_its_size(robot: Create2Sim, group: int, size: int) -> None:
-    assert len(answer(robot, bytes((142, group)))) == size
-
-
-def test_a_create2_counts_in_16_bits_and_tells_its_mode(robot: Create2Sim) -> None:
-    assert answer(robot, bytes((149, 3, 43, 44, 35))) == struct.pack(">HHB", 65436, 4464, 2)
-
-
-def test_a_create2_knows_the_length_of_commands_it_does_not_carry_out(robot: Create2Sim) -> None:
-    ignored = bytes((140, 0, 2, 60, 32, 64, 32)) + bytes((141, 0)) + bytes((164, 65, 66, 67, 68)) + bytes((145, 0, 100, 0, 100))
-    assert answer(robot, ignored + bytes((142, 35))) == b"\x02"
-
-
-def test_a_create2_that_is_off_hears_only_start() -> None:
-    assert answer(Create2Sim(Counting(Turned())), bytes((142, 35))) == b""
-
-
-def test_a_create2_reboots(robot: Create2Sim) -> None:
-    robot.receive(b"\x07", 5.0)
-    assert robot.emit(5.1) + robot.emit(6.1) == b"Soft reset!\n\xfe"
-    assert robot.emit(8.1).startswith(b"Roomba")
-    assert answer(robot, bytes((142, 35))) == b"", "it is off again"
-
-
-def test_a_roboclaw_takes_a_command_in_pieces_and_answers_by_any_address() -> None:
-    board = RoboClawSim(Counting(Turned()))
-    command = roboclaw.write_command(0x83, 37, struct.pack(">ii", 1000, -1000))
-    for k, byte in enumerate(command):
-        assert board.emit(1.0) == b""
-        board.receive(bytes((byte,)), 1.0 + 0.001 * k)
-    assert board.emit(1.1) == b"\xff"
-    assert roboclaw.decode_counts(0x83, answer(board, bytes((0x83, roboclaw.READ_ENCODERS)))) == (-100, 70000)
-
-
-def test_a_roboclaw_drops_half_a_command_and_one_with_a_wrong_sum() -> None:
-    board = RoboClawSim(Counting(Turned()))
-    board.receive(roboclaw.write_command(0x80, 37, bytes(8))[:5], 1.0)
-    assert roboclaw.decode_counts(0x80, answer(board, bytes((0x80, roboclaw.READ_ENCODERS)))) == (-100, 70000)
-    assert answer(board, roboclaw.write_command(0x80, 6, b"\x10")[:-1] + b"\0") == b""
-
-
 @pytest.mark.parametrize("question", [0x91, ydlidar_wire.HEALTH])
 def test_a_ydlidar_tells_its_health_by_the_old_command_and_the_new(question: int) -> None:
-    lidar = YdlidarSim("x4", Sight(Standing(ROOM, POSE)))
+    lidar = YdlidarSim("x4", sight())
     assert answer(lidar, ydlidar_wire.command(question)) == ydlidar_wire.answer(ydlidar_wire.HEALTH_TYPE, b"\0\0\0")
+
+
+@pytest.mark.parametrize(("code", "body"), [
+    (0x0D, struct.pack("<I", 800)), (0x09, struct.pack("<I", 810)), (0x0C, struct.pack("<I", 700)),
+    (0xD1, b"\0"), (0xD0, b"\0"), (0x93, bytes(4)), (0xD9, b"\0"),
+])  # fmt: skip
+def test_a_ydlidar_tells_its_settings(code: int, body: bytes) -> None:
+    said = answer(YdlidarSim("x4", sight()), ydlidar_wire.command(code))
+    assert said == ydlidar_wire.answer(ydlidar_wire.INFO_TYPE, body)
+
+
+@pytest.mark.parametrize(("key", "value"), [
+    (rplidar_wire.CONF_SPEED, struct.pack("<HH", 600, 660)), (rplidar_wire.CONF_SLOWEST, struct.pack("<H", 300)),
+    (rplidar_wire.CONF_FASTEST, struct.pack("<H", 1200)), (rplidar_wire.CONF_MODEL_NAME, b"RPLIDAR C1M1\0"),
+])  # fmt: skip
+def test_an_rplidar_tells_its_speeds_and_its_name(key: int, value: bytes) -> None:
+    said = answer(RplidarSim("rplidar-c1", sight()), rplidar_wire.conf_request(key))
+    assert said == rplidar_wire.answer(rplidar_wire.CONF_TYPE, rplidar_wire.Conf(key, value).encode())
+
+
+def test_a_hokuyo_reboots_when_it_is_told_twice() -> None:
+    lidar = HokuyoSim(HOKUYOS["hokuyo-urg"], sight())
+    assert answer(lidar, b"RB\n") == scip.encode_message(b"RB", b"01")
+    assert answer(lidar, b"RB\n") == scip.encode_message(b"RB", b"00")
+    assert answer(lidar, b"BM\n") == scip.encode_message(b"BM", b"10"), "it boots"
+
+
+def told(scanner: SickSim, payload: bytes) -> bytes:
+    """The payload of the answer, behind the byte that acknowledges the request."""
+    said = answer(scanner, sick_lms.encode(payload), 0.0)
+    size = 7 + (said[3] | said[4] << 8)
+    decoded = sick_lms.decode(said[1:size])
+    assert said[0] == sick_lms.ACK and decoded is not None
+    return decoded[1]
+
+
+def test_a_sick_tells_what_it_is_and_how_it_is_set() -> None:
+    scanner = SickSim(sight())
+    assert told(scanner, sick_lms.TYPE)[1:11] == b"LMS291;S05"
+    assert told(scanner, sick_lms.ERRORS) == b"\xb2\x10", "none"
+    told(scanner, sick_lms.variant_request(100, 0.25))
+    status = told(scanner, sick_lms.STATUS)
+    assert struct.unpack_from("<HH", status, 107) == (100, 25)
+    assert (status[8], status[122]) == (0x25, 1), "polled, in millimetres"
+
+
+def test_a_sick_changes_its_unit_only_behind_its_password() -> None:
+    scanner = SickSim(sight())
+    config = bytearray(told(scanner, bytes((sick_lms.GET_CONFIG,)))[1:-1])
+    assert len(config) == 34
+    config[6] = 0
+    wish = bytes((sick_lms.SET_CONFIG,)) + config
+    assert told(scanner, wish)[1] == 0
+    assert told(scanner, sick_lms.INSTALL[:-1] + b"X") == b"\xa0\x01\x10"
+    assert told(scanner, sick_lms.INSTALL) == b"\xa0\x00\x10"
+    assert told(scanner, wish)[1:-1] == b"\x01" + bytes(config)
+    scan = sick_lms.ScanPayload.decode(told(scanner, sick_lms.ONE_SCAN))
+    assert scan is not None and not scan.is_mm
+
+
+def test_a_sick_answers_a_poll_with_a_scan_and_refuses_a_mode_it_has_not() -> None:
+    scanner = SickSim(sight())
+    scan = sick_lms.ScanPayload.decode(told(scanner, sick_lms.ONE_SCAN))
+    assert scan is not None and len(scan.values) == 361
+    assert told(scanner, b"\x20\x2e") == b"\xa0\x02\x10"
+
+
+def test_the_parts_of_a_sick_scan_are_the_scan() -> None:
+    scanner = SickSim(sight())
+    whole = sick_lms.ScanPayload.decode(told(scanner, sick_lms.ONE_SCAN))
+    told(scanner, bytes((sick_lms.MODE, sick_lms.RATE_CODES[500000])))
+    told(scanner, sick_lms.PARTIAL)
+    scanner.emit(5.0)
+    stream = scanner.emit(5.1)
+    first = struct.unpack_from("<H181H", stream, 5)
+    second = struct.unpack_from("<H180H", stream, 10 + 2 * 181 + 5)
+    assert (first[0], second[0]) == (181 | 0x6000, 180 | 0x6000 | 2 << 11)
+    assert whole is not None
+    assert np.array_equal(first[1:], whole.values[0::2]) and np.array_equal(second[1:], whole.values[1::2])
