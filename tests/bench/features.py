@@ -1,7 +1,11 @@
-"""How features bear noise, and how the time of every stage of merging grows with the number of features and the size of the map.
+"""How features bear noise, and what those of the recordings' maps are: how many, how many bytes, how much CPU.
 
-.venv/bin/python -m tests.bench.features            tables, and out/bench/features_*.svg
+.venv/bin/python -m tests.bench.features                    tables; the second needs the kit in BENCH_DATA
+.venv/bin/python -m tests.bench.features --kit-stride 1     every fitting pair of the kit
 .venv/bin/python -m tests.bench.features --json
+
+CPU is that of one raw map: its feature map alone, and with all that matching keeps of a map as well (field, corners, directions,
+signatures); the median and the worst of the maps.  How both grow: `tests.bench.merge_cost`.
 """
 
 from __future__ import annotations
@@ -11,37 +15,24 @@ import json
 import math
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from agent.features.extraction import extract_features, feature_map
-from agent.features.field import MatchField
-from agent.features.lines import wall_lines
-from agent.features.paper import paper_features
-from agent.features.signatures import MAX_TARGETS
+from agent.features.extraction import extract_features
 from agent.features.snapshot import MapSnapshot
-from agent.features.wall_points import wall_points
-from agent.features.working import WorkingGrid
-from agent.merging.equations import FactorCounter
 from agent.merging.matched_features import matched_features
-from agent.merging.matching import match_maps, verify_match
-from agent.merging.paper import rotation_candidates, similar_features, translation_candidates
-from agent.merging.search import FIRST_PASS, search
 from protocol.features import FeatureMap
 from protocol.fields import FEATURES
 from protocol.geometry import SE2, wrap_angle
-from tests.bench.line_chart import exponent, log_log_chart
+from protocol.grid import OccupancyGrid
 from tests.bench.map_pairs import kit_pairs
 from tests.bench.tables import markdown
 from tests.harness.floorplans import office
 
-OUT = Path(__file__).resolve().parents[2] / "out" / "bench"
 KINDS = ("lines", "circles", "arcs", "curves")
 NOISE_M = (0.0, 0.02, 0.04, 0.06, 0.1)
-ROOMS = (4, 8, 16, 32, 64)
 T_A, T_B = SE2(3.0, -2.0, 0.3), SE2(-10.0, 5.0, 2.1)
 
 
@@ -83,117 +74,69 @@ def _repeated(pairs: list[tuple[FeatureMap, FeatureMap]]) -> dict[str, Any]:
     }
 
 
-def against_size() -> list[dict[str, Any]]:
-    """CPU of every stage on buildings of more and more rooms, two maps of 10 cm cells with a half in common."""
-    return [_stages(rooms) for rooms in ROOMS]
-
-
-def _stages(rooms: int) -> dict[str, Any]:
-    plan = office(7, rooms)
-    ours = plan.mapped(T_A, 0.1, (-1, 0.75 * plan.width_m))
-    theirs = plan.mapped(T_B, 0.1, (0.25 * plan.width_m, 1e4))
-    working = WorkingGrid.of(ours)
-    walls = wall_points(working)
-    lines = wall_lines(walls, working.resolution_m)
-    mine, yours = paper_features(ours), paper_features(theirs)
-    pairs = similar_features(mine, yours, 0.15)
-    ours_kept, theirs_kept = MapSnapshot.of(ours), MapSnapshot.of(theirs)
-    result = match_maps(ours_kept, theirs_kept)
-    assert result.accepted, f"{rooms} rooms: {result.reason}"
-    T = result.T_ours_theirs
-    assert T is not None
-    counter = FactorCounter.of(ours, theirs)
-    return {
-        "rooms": rooms,
-        "cells": int(ours.cells.size),
-        "features": len(extract_features(ours)),
-        "paper_features": len(mine),
-        "wall_points_ms": _ms(lambda: wall_points(working)),
-        "lines_ms": _ms(lambda: wall_lines(walls, working.resolution_m)),
-        "round_and_curves_ms": _ms(lambda: feature_map(working, walls, lines, ours.origin)),
-        "field_ms": _ms(lambda: MatchField.of(working, walls)),
-        "signatures_ms": _ms(lambda: ours_kept._signatures(MAX_TARGETS)),
-        "first_pass_ms": _ms(lambda: search(ours_kept, theirs_kept, FIRST_PASS)),
-        "match_ms": _ms(lambda: match_maps(ours_kept, theirs_kept)),
-        "verify_ms": _ms(lambda: verify_match(ours_kept, theirs_kept, T)),
-        "match_factor_ms": _ms(lambda: counter.at(T)),
-        "paper_features_ms": _ms(lambda: paper_features(ours)),
-        "paper_vote_ms": _ms(lambda: [list(translation_candidates(pairs, t)) for t in rotation_candidates(pairs, 1.0)]),
-    }
-
-
-def of_recordings() -> list[dict[str, Any]]:
-    """Features of the kit's maps, the median of each building: how many, how many bytes on the wire, CPU."""
+def of_recordings(stride: int) -> list[dict[str, Any]]:
+    """Features of both maps of the kit's fitting pairs, by building and resolution."""
     by_log: dict[str, list[list[float]]] = {}
-    for pair in kit_pairs("main", "pos", stride=3):
-        started = time.process_time()
-        features = extract_features(pair.ours)
-        cpu_ms = (time.process_time() - started) * 1e3
-        counts = [len(getattr(features, kind)) for kind in KINDS]
-        row = [*counts, _wire_bytes(FeatureMap(lines=features.lines)), _wire_bytes(features), cpu_ms]
-        by_log.setdefault(pair.name.split()[1], []).append(row)
-    names = [*KINDS, "line_bytes", "all_bytes", "cpu_ms"]
-    return [
-        {"recording": log, **dict(zip(names, np.round(np.median(rows, axis=0), 1).tolist(), strict=True))}
-        for log, rows in by_log.items()
-    ]
+    for pair in kit_pairs("main", "pos", stride):
+        _, log, resolution = pair.name.split()
+        for grid in (pair.ours, pair.theirs):
+            features = extract_features(grid)
+            counts = [len(getattr(features, kind)) for kind in KINDS]
+            sizes = [_wire_bytes(FeatureMap(lines=features.lines)), _wire_bytes(features)]
+            cpu = [cpu_ms(lambda grid=grid: extract_features(grid)), cpu_ms(lambda grid=grid: prepared(grid))]  # type: ignore[misc]
+            by_log.setdefault(f"{log} {resolution} m", []).append([*counts, *sizes, *cpu])
+    rows = []
+    for log, found in by_log.items():
+        median, worst = np.median(found, axis=0).round(1).tolist(), np.max(found, axis=0).round(1).tolist()
+        names = (*KINDS, "line bytes", "all bytes")
+        cpu = {
+            name: f"{median[k]} ({worst[k]})"
+            for k, name in ((-2, "features, CPU ms (worst)"), (-1, "all that is kept, ms (worst)"))
+        }
+        rows.append({"recording": log, "maps": len(found), **dict(zip(names, median, strict=False)), **cpu})
+    return rows
+
+
+def prepared(grid: OccupancyGrid) -> MapSnapshot:
+    """Everything that matching derives from one map before it meets another, and the feature map."""
+    snapshot = MapSnapshot.of(grid)
+    for part in ("thin_kinds", "field", "corners", "directions", "signatures", "features"):
+        getattr(snapshot, part)
+    return snapshot
 
 
 def _wire_bytes(features: FeatureMap) -> int:
     return len(FEATURES.pack(features)[1])
 
 
-def _ms(work: Callable[[], object]) -> float:
-    """Median CPU of five runs after a first one."""
+def cpu_ms(work: Callable[[], object], runs: int = 3) -> float:
+    """Median CPU of some runs after a first one."""
     work()
     times = []
-    for _ in range(5):
+    for _ in range(runs):
         started = time.process_time()
         work()
         times.append((time.process_time() - started) * 1e3)
-    return round(max(0.01, float(np.median(times))), 2)
-
-
-def as_markdown(*of: list[dict[str, Any]]) -> str:
-    size = of[1]
-    tables = [
-        markdown([{name: "-" if value is None else str(value) for name, value in row.items()} for row in rows])
-        for rows in of
-        if rows
-    ]
-    growth = [
-        f"{name} n^{exponent([(row['features'], row[name]) for row in size]):.2f}" for name in size[0] if name.endswith("_ms")
-    ]
-    return "\n\n".join([*tables, "growth with the number of features n: " + ", ".join(growth)])
-
-
-def draw(size: list[dict[str, Any]]) -> list[Path]:
-    """One chart over the number of features, one over the cells."""
-    OUT.mkdir(parents=True, exist_ok=True)
-    written = []
-    for column, label in (("features", "features of one map"), ("cells", "cells of one map")):
-        series = {
-            name.removesuffix("_ms"): [(row[column], row[name]) for row in size] for name in size[0] if name.endswith("_ms")
-        }
-        path = OUT / f"features_{column}.svg"
-        path.write_text(log_log_chart("CPU of each stage of merging", label, "ms", series))
-        written.append(path)
-    return written
+    return max(0.01, float(np.median(times)))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--seeds", type=int, default=10, help="buildings per noise level (default 10)")
+    parser.add_argument("--kit-stride", type=int, default=3, metavar="N", help="every N-th fitting pair of the kit (default 3)")
     args = parser.parse_args()
     cv2.setNumThreads(1)
-    noise, size, recordings = against_noise(range(args.seeds)), against_size(), of_recordings()
-    charts = draw(size)
-    if args.json:
-        print(json.dumps({"noise": noise, "size": size, "recordings": recordings}, indent=1))
-    else:
-        print(as_markdown(noise, size, recordings))
-        print("\n" + "\n".join(f"chart: {path}" for path in charts))
+    noise, recordings = against_noise(range(args.seeds)), of_recordings(args.kit_stride)
+    print(json.dumps({"noise": noise, "recordings": recordings}, indent=1) if args.json else tables(noise, recordings))
+
+
+def tables(*of: list[dict[str, Any]]) -> str:
+    return "\n\n".join(
+        markdown([{name: "-" if value is None else str(value) for name, value in row.items()} for row in rows])
+        for rows in of
+        if rows
+    )
 
 
 if __name__ == "__main__":
