@@ -77,6 +77,23 @@ def _solve(edges: tuple[Edge, ...]) -> Layout:
     return Layout(tuple(groups), tuple(rejected), {robot: group for group in groups for robot in group.T_root})
 
 
+def connected(edges: Iterable[Edge], robot: str) -> list[Edge]:
+    """The edges of everybody whom a chain of edges joins to this robot: the others cannot move its frame."""
+    beside: dict[str, list[Edge]] = defaultdict(list)
+    for edge in edges:
+        beside[edge.a].append(edge)
+        beside[edge.b].append(edge)
+    reached, queue, found = {robot}, [robot], {}
+    for here in queue:
+        for edge in beside.get(here, ()):
+            found[edge.id] = edge
+            there = edge.b if edge.a == here else edge.a
+            if there not in reached:
+                reached.add(there)
+                queue.append(there)
+    return list(found.values())
+
+
 def _components(edges: tuple[Edge, ...]) -> list[list[Edge]]:
     """Edges by connected component."""
     leader: dict[str, str] = {}

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterable
 
 from agent.fleet.effects import Effect, Note, Send
-from agent.fleet.frame_graph import Edge, Group, Layout, solve
+from agent.fleet.frame_graph import Edge, Group, Layout, connected, solve
 from agent.fleet.members import Peer, Roster
 from agent.fleet.options import FleetOptions
 from agent.fleet.own_map import OwnMap
@@ -33,6 +33,7 @@ class Ledger:
         self.live: dict[PairKey, Evidence] = {}
         self._edges: dict[PairKey, Edge] = {}  # of `live`
         self._layout = Layout()
+        self._connected = {robot}  # everybody whom a chain of live edges joins to us, when the layout was solved
         self._is_layout_old = False
         self.effects: list[Effect] = []
         self.clock, self.timetable = Clock(), Timetable()
@@ -45,7 +46,7 @@ class Ledger:
 
     @property
     def layout(self) -> Layout:
-        """The frames of all groups, solved when they are asked for: statements come in crowds."""
+        """The frames of all that is connected to us, solved when they are asked for: statements come in crowds."""
         if self._is_layout_old:
             self._is_layout_old = False
             self._solve()
@@ -121,8 +122,9 @@ class Ledger:
                 self.note("merged", a=key[0], b=key[1], match_factor=evidence.match_factor, T_a_b=(T.x_m, T.y_m, T.theta_rad))
             self.live[key], e = evidence, evidence
             self._edges[key] = Edge(e.robot_a, e.robot_b, e.T_a_b, e.covariance, e.overlap_m2 * e.match_factor, e.id())
-        self._is_layout_old = True
-        self.timetable.next_scan_s = now_s
+        if a in self._connected or b in self._connected:
+            self._is_layout_old = True
+            self.timetable.next_scan_s = now_s
 
     def judge_all(self, robot: str, now_s: float) -> None:
         """Look again at every edge of one robot."""
@@ -133,10 +135,16 @@ class Ledger:
         for other in others:
             self.judge_pair(robot, other, now_s)
 
+    def rejected(self) -> set[bytes]:
+        """Ids of the live edges of any group that contradict the others."""
+        return {edge.id for edge in solve(self._edges.values()).rejected}
+
     def _solve(self) -> None:
         """Solve the frames anew, and name the edges that came to contradict the others."""
         known = {edge.id for edge in self._layout.rejected}
-        self._layout = solve(self._edges.values())
+        ours = connected(self._edges.values(), self.robot)
+        self._layout = solve(ours)
+        self._connected = {self.robot}.union(*((edge.a, edge.b) for edge in ours))
         for edge in self._layout.rejected:
             if edge.id not in known:
                 self.note("edge-contradicts-loops", is_warning=True, a=edge.a, b=edge.b)

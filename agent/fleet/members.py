@@ -79,10 +79,10 @@ class Peer:
     @property
     def map(self) -> MapVersion | None:
         """The newest version it is known to have."""
-        spoken = [v for v in (self.beat.map if self.beat else None, self.announcement.map if self.announcement else None) if v]
-        if len(spoken) == 2 and spoken[0].frame == spoken[1].frame:
-            return max(spoken, key=lambda version: version.revision)
-        return spoken[0] if spoken else None
+        beaten, announced = self.beat.map if self.beat else None, self.announcement.map if self.announcement else None
+        if beaten is None or announced is None:
+            return beaten or announced
+        return announced if announced.frame == beaten.frame and announced.revision > beaten.revision else beaten
 
     @property
     def is_in_frame(self) -> bool:

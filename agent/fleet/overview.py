@@ -31,7 +31,7 @@ class Overview:
             frames = {
                 robot: FrameState(T, seen.covariance[robot], self._silent_s(robot, now_s)) for robot, T in seen.T_root.items()
             }
-        rejected = {edge.id for edge in ledger.layout.rejected}
+        rejected = ledger.rejected()
         return FleetState(
             self._ledger.robot,
             is_twin,
