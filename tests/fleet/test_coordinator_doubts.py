@@ -15,7 +15,7 @@ from agent.merging.result import MatchFactor, MatchStatus, MergeResult
 from protocol.codec import encode
 from protocol.features import FeatureMap
 from protocol.geometry import SE2
-from protocol.messages import Beat, MapAnnouncement, Stance
+from protocol.messages import Beat, MapAnnouncement, MapVersion, Stance
 from tests.fleet.explorer import Explorer, random_world
 from tests.fleet.groups import PLACES, WORLD, edges, events, fleet_of, names
 from tests.fleet.simulation import Fleet, Node, truthful
@@ -184,3 +184,22 @@ def test_a_table_full_of_strangers_stays_bounded() -> None:
     for i in range(200):
         coordinator.on_message(Beat(f"x{i}", i, 1, 1.0, 1.0, None, b"", b""), 0.1 * i)
     assert len(coordinator.state(20.0).peers) == 20
+
+
+def test_in_a_fleet_larger_than_one_turn_the_most_alike_is_looked_at_first() -> None:
+    coordinator, explorer = Coordinator("r0", 1), Explorer.at(WORLD, PLACES[0], 0.0)
+    explorer.look(PLACES[0], 12)
+    rng = np.random.default_rng(1)
+    ours, *others = (FeatureMap(lines=rng.uniform(1.0, 15.0, (20, 6)).astype(np.float32)) for _ in range(151))
+    coordinator.on_local_map(explorer, ours, 0.0)
+    for i, features in enumerate([*others, ours]):
+        version = MapVersion(i + 1, 1, bytes([i]) * 16)
+        coordinator.on_message(MapAnnouncement(f"x{i:03}", i, version, 0.5, 100.0, 1_000, features, False), 0.01)
+        coordinator.on_message(Beat(f"x{i:03}", i, 1, 1.0, 1.0, version, b"", b""), 0.01)
+    asked = []
+    for t in range(1, 8):
+        for effect in coordinator.tick(0.2 * t):
+            if isinstance(effect, Fetch):
+                asked.append(effect.peer)
+                coordinator.on_fetched(effect, None, 0.2 * t)
+    assert "x150" in asked
