@@ -30,6 +30,7 @@ from protocol.geometry import SE2
 from protocol.grid import OccupancyGrid
 from tests.bench.map_pairs import MapPair, overlap_middle
 from tests.bench.recordings import load
+from tests.bench.tables import markdown
 
 LOGS = ("acapulco", "freiburg-079", "freiburg-campus", "intel", "seattle")
 TRAVEL_M = (1.0, 3.0, 6.0, 12.0, 25.0)
@@ -159,26 +160,26 @@ def measured(logs: list[str], travel_m: list[float], count: int, resolution_m: f
     return rows
 
 
-def as_markdown(rows: list[dict[str, Any]], by: str) -> str:
-    lines = [
-        f"| {by} | queries | best correct | accepted, correct | wrong | strangers: accepted | error cm, median (95 %) "
-        "| CPU ms, median (95 %) |",
-        "|" + "---|" * 8,
-    ]
+def summed_up(rows: list[dict[str, Any]], by: str) -> str:
+    told = []
     for value in dict.fromkeys(row[by] for row in rows):
         mine = [row for row in rows if row[by] == value and row["own"]]
         theirs = [row for row in rows if row[by] == value and not row["own"]]
         good = [row["error_cm"] for row in mine if row["right"] and row["accepted"]] or [math.nan]
         cpu = [row["cpu_ms"] for row in mine]
-        lines.append(
-            f"| {value} | {len(mine)} | {np.mean([r['right'] for r in mine]):.3f} "
-            f"| {np.mean([r['right'] and r['accepted'] for r in mine]):.3f} "
-            f"| {sum(r['accepted'] and not r['right'] for r in mine)} "
-            f"| {sum(r['accepted'] for r in theirs)} of {len(theirs)} "
-            f"| {np.median(good):.1f} ({np.percentile(good, 95):.1f}) "
-            f"| {np.median(cpu):.0f} ({np.percentile(cpu, 95):.0f}) |"
+        told.append(
+            {
+                by: value,
+                "queries": len(mine),
+                "best correct": f"{np.mean([r['right'] for r in mine]):.3f}",
+                "accepted, correct": f"{np.mean([r['right'] and r['accepted'] for r in mine]):.3f}",
+                "wrong": sum(r["accepted"] and not r["right"] for r in mine),
+                "strangers: accepted": f"{sum(r['accepted'] for r in theirs)} of {len(theirs)}",
+                "error cm, median (95 %)": f"{np.median(good):.1f} ({np.percentile(good, 95):.1f})",
+                "CPU ms, median (95 %)": f"{np.median(cpu):.0f} ({np.percentile(cpu, 95):.0f})",
+            }
         )
-    return "\n".join(lines)
+    return markdown(told)
 
 
 def main() -> None:
@@ -195,7 +196,7 @@ def main() -> None:
     if args.json:
         print(json.dumps(rows, indent=1))
         return
-    print(f"{as_markdown(rows, 'travel_m')}\n\n{as_markdown(rows, 'log')}")
+    print(f"{summed_up(rows, 'travel_m')}\n\n{summed_up(rows, 'log')}")
     for row in rows:
         if row["accepted"] and not row["right"]:
             print(f"WRONG {row['query']}{'' if row['own'] else ' in another building'}: {row['error_cm']}")

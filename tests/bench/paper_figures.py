@@ -102,10 +102,7 @@ def judged(row: dict[str, Any]) -> str:
 
 
 def summary(rows: list[dict[str, Any]]) -> str:
-    lines = [
-        "| method | fitting pairs: right / wrong / not merged | strangers merged | CPU ms median (slowest tenth) | times ours |",
-        "|---|---|---|---|---|",
-    ]
+    told = []
     ours_ms = {r["pair"]: r["cpu_ms"] for r in rows if r["method"] == "hybrid"}
     for method in METHODS:
         mine = [r for r in rows if r["method"] == method]
@@ -113,13 +110,17 @@ def summary(rows: list[dict[str, Any]]) -> str:
             continue
         fit, unfit = [r for r in mine if r["should_merge"]], [r for r in mine if not r["should_merge"]]
         right, wrong = (sum(judged(r) == word for r in fit) for word in ("right", "**WRONG**"))
-        false = sum(r["verdict"] == "merged" for r in unfit)
         cpu, times_ours = [r["cpu_ms"] for r in mine], [r["cpu_ms"] / ours_ms[r["pair"]] for r in mine]
-        lines.append(
-            f"| {method} | {right} / {wrong} / {len(fit) - right - wrong} of {len(fit)} | {false} of {len(unfit)} | "
-            f"{np.median(cpu):.0f} ({np.percentile(cpu, 90):.0f}) | {np.median(times_ours):.1f} |"
+        told.append(
+            {
+                "method": method,
+                "fitting pairs: right / wrong / not merged": f"{right} / {wrong} / {len(fit) - right - wrong} of {len(fit)}",
+                "strangers merged": f"{sum(r['verdict'] == 'merged' for r in unfit)} of {len(unfit)}",
+                "CPU ms median (slowest tenth)": f"{np.median(cpu):.0f} ({np.percentile(cpu, 90):.0f})",
+                "times ours": f"{np.median(times_ours):.1f}",
+            }
         )
-    return "\n".join(lines)
+    return markdown(told)
 
 
 def all_pairs(kit_stride: int) -> Iterable[MapPair]:
