@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _record(device: Device, recorder: Recorder, seconds: float) -> int:
     """Let the device run for so long, or until Ctrl-C; how many readings it gave."""
-    device.tap = recorder
+    device.record(recorder)
     end_s = time.monotonic() + (seconds + START_S if seconds else float("inf"))
     has_begun = False
     try:

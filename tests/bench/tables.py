@@ -12,5 +12,11 @@ def markdown(rows: Sequence[Mapping[str, object]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
+def next_line(row: Mapping[str, object], is_first: bool) -> str:
+    """One more line of a table that is printed while it grows; the first brings the heading."""
+    lines = markdown([row]).splitlines()
+    return "\n".join(lines if is_first else lines[2:])
+
+
 def _cell(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,7 +1,7 @@
 """Other people's software connects to `mapquilt sim` and measures the room, or the wheels: are our bytes right?
 
     python3 -m venv /tmp/clients && /tmp/clients/bin/pip install rplidar-roboticia pyrplidar pyrplidarsdk rplidarc1 \\
-        adafruit-circuitpython-rplidar lds2d PyLidar3 hokuyolx pycreate2 yarc create-serial basicmicro
+        adafruit-circuitpython-rplidar lds2d PyLidar3 hokuyolx pycreate2 yarc create-serial basicmicro kobukidriver
     apt-get install mrpt-apps                                            # rawlog-grabber, for Hokuyo and SICK
     .venv/bin/python -m tests.campaigns.independent_clients --python /tmp/clients/bin/python
 
@@ -33,6 +33,7 @@ from hw.sim.catalogue import BASES
 from hw.sim.raycast import cast_all
 from hw.sim.robot import SimulatedRobot
 from hw.sim.world import open_world
+from tests.bench.tables import next_line
 from tests.harness.serial_device import POSE, ROOM
 from tests.harness.waiting import until
 
@@ -78,6 +79,7 @@ CASES = [  # (client, device, what the client is told, baud it is told)
     ("yarc", "create2", "-", 0),
     ("create-serial", "create2", "-", 0),
     ("basicmicro", "roboclaw", "-", 0),
+    ("kobukidriver", "kobuki", "-", 0),
 ]
 MODULES = {"rplidar-roboticia": "rplidar", "adafruit-rplidar": "adafruit_rplidar", "pylidar3": "PyLidar3"}
 FIELDS_DEG = {"hokuyo-urg": (-119.53125, 119.8828125), "hokuyo-utm": (-135.0, 135.0), "sick-lms291": (-90.0, 90.0)}
@@ -125,12 +127,12 @@ def main() -> int:
     parser.add_argument("--only", default="", help="client or device")
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
-    rows = []
+    rows: list[Row] = []
     for case in CASES:
         if args.only in ("", *case):
             rows.append(judged(args.python, *case))
             if not args.json:
-                print(("" if len(rows) > 1 else HEAD) + line(rows[-1]), flush=True)
+                print(next_line(figures(rows[-1]), is_first=len(rows) == 1), flush=True)
     if args.json:
         print(json.dumps([asdict(row) for row in rows], indent=2))
     return int(any(row.verdict.startswith("WRONG") for row in rows))
@@ -255,7 +257,7 @@ def way_errors_m(device: str, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
     robot.poses_at(clock_s[:1])
     went_m = robot.poses_at(clock_s)[:, 3:5]
     read = np.array(rows)
-    bits = 16 if device == "create2" else 32
+    bits = 16 if device in ("create2", "kobuki") else 32
     ticks = np.cumsum((np.diff(read[:, 1:], axis=0) + 2 ** (bits - 1)) % 2**bits - 2 ** (bits - 1), axis=0)
     read_m = ticks * math.tau * drive.wheel_radius_m / drive.ticks_per_revolution
     later = np.round((read[1:, 0] - read[0, 0]) / step_s).astype(int)
@@ -269,16 +271,18 @@ def way_errors_m(device: str, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
     return best(went_m), best(went_m[:, ::-1])
 
 
-HEAD = """\
-| client | device | mode | readings | median | 95 % | mirrored, or the other wheel | verdict |
-| --- | --- | --- | --- | --- | --- | --- | --- |
-"""
-
-
-def line(row: Row) -> str:
-    """Of a Markdown table."""
-    figures = [f"{1e3 * value:.1f} mm" for value in (row.median_m, row.p95_m, row.control_median_m)]
-    return f"| {row.client} | {row.device} | {row.mode} | {row.readings} | {' | '.join(figures)} | {row.verdict} |"
+def figures(row: Row) -> dict[str, object]:
+    """As people read them."""
+    return {
+        "client": row.client,
+        "device": row.device,
+        "mode": row.mode,
+        "readings": row.readings,
+        "median": f"{1e3 * row.median_m:.1f} mm",
+        "95 %": f"{1e3 * row.p95_m:.1f} mm",
+        "mirrored, or the other wheel": f"{1e3 * row.control_median_m:.1f} mm",
+        "verdict": row.verdict,
+    }
 
 
 if __name__ == "__main__":

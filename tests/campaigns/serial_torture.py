@@ -19,6 +19,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from hw.driver import Driver
+from tests.bench.tables import next_line
 from tests.harness.bad_line import KINDS, damaged
 from tests.harness.lidar_streams import STREAMS, Stream, decode, errors_m
 
@@ -58,11 +59,14 @@ def main() -> int:
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     names = args.only.split(",") if args.only else list(STREAMS)
-    tallies = []
+    how = "one by one" if args.kind == "bytes" else "in bursts"
+    if not args.json:
+        print(f"{args.share:.3%} of the bytes lost or altered, {how}\n")
+    tallies: list[Tally] = []
     for name in names:
         tallies.append(torture(name, args.hours, args.share, args.seed, args.kind))
         if not args.json:
-            print(row(tallies[-1]) if len(tallies) > 1 else head(args.share, args.kind) + "\n" + row(tallies[-1]), flush=True)
+            print(next_line(figures(tallies[-1]), is_first=len(tallies) == 1), flush=True)
     if args.json:
         print(json.dumps([asdict(tally) for tally in tallies], indent=2))
     return int(any(tally.wrong_scans for tally in tallies if tally.has_checksum))
@@ -108,25 +112,20 @@ def _feed(driver: Driver, data: bytes, now_s: float, stream: Stream, tally: Tall
         tally.wrong_beams += int(is_wrong.sum())
 
 
-def head(share: float, kind: str) -> str:
-    """Of a Markdown table."""
-    how = "one by one" if kind == "bytes" else "in bursts"
-    return (
-        f"{share:.3%} of the bytes lost or altered, {how}\n\n"
-        "| protocol | hours | damaged bytes | good frames | frames refused | scans handed on | wrong scans | worst beam | CPU |\n"
-        "|---|---|---|---|---|---|---|---|---|"
-    )
-
-
-def row(t: Tally) -> str:
-    """Of the same."""
-    wrong = (
-        f"{t.wrong_scans}" if t.has_checksum else f"{t.wrong_beams} beams, {t.wrong_beams / max(1, t.damaged_bytes):.3f} a byte"
-    )
-    return (
-        f"| {t.protocol} | {t.robot_hours:.1f} | {t.damaged_bytes:,} | {t.frames:,} | {t.refused_frames:,} "
-        f"| {t.scans:,} ({t.scans / max(1, t.scans_sent):.1%}) | {wrong} | {100 * t.worst_error_m:.1f} cm | {t.cpu_s:.0f} s |"
-    )
+def figures(t: Tally) -> dict[str, object]:
+    """As people read them."""
+    beams = f"{t.wrong_beams} beams, {t.wrong_beams / max(1, t.damaged_bytes):.3f} a byte"
+    return {
+        "protocol": t.protocol,
+        "hours": f"{t.robot_hours:.1f}",
+        "damaged bytes": f"{t.damaged_bytes:,}",
+        "good frames": f"{t.frames:,}",
+        "frames refused": f"{t.refused_frames:,}",
+        "scans handed on": f"{t.scans:,} ({t.scans / max(1, t.scans_sent):.1%})",
+        "wrong scans": t.wrong_scans if t.has_checksum else beams,
+        "worst beam": f"{100 * t.worst_error_m:.1f} cm",
+        "CPU": f"{t.cpu_s:.0f} s",
+    }
 
 
 if __name__ == "__main__":

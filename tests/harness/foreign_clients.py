@@ -16,6 +16,7 @@ import contextlib
 import itertools
 import json
 import math
+import os
 import socket
 import sys
 import threading
@@ -154,10 +155,11 @@ def relay(server: socket.socket, line: serial.Serial) -> None:
                 client.sendall(line.read(waiting))
 
 
-def ticks(read: Callable[[], list[float]]) -> Rows:
+def ticks(read: Callable[[], list[float]], await_news: Callable[[], None] = lambda: None) -> Rows:
     """Readings of both counters over a few seconds, each with its time."""
     rows = []
     for _ in range(60):
+        await_news()
         rows.append([time.time(), *read()])
         time.sleep(0.08)
     return rows
@@ -196,6 +198,28 @@ def create_serial(port: str, mode: str, baud: int) -> Rows:
     return ticks(lambda: [robot.sensors([which])[which] for which in (ENCODER_LEFT, ENCODER_RIGHT)])
 
 
+def kobukidriver(port: str, mode: str, baud: int) -> Rows:
+    """Looks for its port by the name of the adapter, and never ends by itself."""
+    import serial.tools.list_ports as ports
+    from kobukidriver import Kobuki
+
+    ports.comports = lambda: [(port, "Kobuki", "")]
+    robot = Kobuki()
+    time.sleep(0.5)
+
+    def read() -> list[float]:
+        sensors = robot.basic_sensor_data()
+        assert sensors["Charger"] == "DISCHARGING" and sensors["Batteryvolt"] == 160, "not where the battery should be"
+        return [int.from_bytes(bytes(sensors[side]), "little") for side in ("Left_encoder", "Right_encoder")]
+
+    def await_news() -> None:
+        deadline_s, before = time.monotonic() + 0.2, read()
+        while read() == before and time.monotonic() < deadline_s:
+            time.sleep(0.001)
+
+    return ticks(read, await_news)
+
+
 def basicmicro(port: str, mode: str, baud: int) -> Rows:
     from basicmicro import Basicmicro
 
@@ -228,6 +252,7 @@ CLIENTS: dict[str, Callable[[str, str, int], Rows]] = {
     "yarc": yarc,
     "create-serial": create_serial,
     "basicmicro": basicmicro,
+    "kobukidriver": kobukidriver,
 }
 
 
@@ -236,7 +261,8 @@ def main() -> None:
     serial.Serial._update_dtr_state = serial.Serial._update_rts_state = lambda self: None
     with contextlib.redirect_stdout(sys.stderr):
         rows = CLIENTS[client](port, mode, int(baud))
-    print(json.dumps(rows))
+    print(json.dumps(rows), flush=True)
+    os._exit(0)  # some leave threads behind that read for ever
 
 
 if __name__ == "__main__":
