@@ -18,20 +18,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.mapping.estimate import MapperStatus
+from agent.mapping.kept_scans import KeptScan
 from agent.mapping.likelihood import AREA
 from agent.mapping.log_odds import LogOddsGrid
 from agent.mapping.loop_closure import LoopCloser
 from agent.mapping.path_graph import LoopEdge
-from agent.mapping.redrawing import Drawing, DrawnScan
+from agent.mapping.redrawing import Drawing
 from protocol.geometry import SE2
 
 if TYPE_CHECKING:
     from agent.mapping.mapper import Mapper
 
 MAGIC = b"MQMC"
-VERSION = 2
+VERSION = 3
 LARGEST_BYTES = 1 << 30  # unpacked; a map of a square kilometre stays below
-DTYPES = {"bool", "uint8", "uint16", "int8", "int32", "int64", "float32", "float64"}
+DTYPES = {"bool", "uint8", "uint16", "int8", "int16", "int32", "int64", "float32", "float64"}
 
 State = dict[str, Any]
 
@@ -109,7 +110,7 @@ def state_of(mapper: Mapper) -> State:
         "keyframe_pose": local.keyframe_pose,
         "keyframe_s": local.keyframe_s,
         "keyframe_variance": local.keyframe_variance,
-        "scans": np.array(local.scans).reshape(-1, 5),
+        "scans": local.scans.rows,
         **search_state(mapper),
         **filter_state(mapper),
         **drawing_state(local.drawing),
@@ -170,7 +171,8 @@ def numbered_anew(tables: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray
 
 
 def drawing_state(drawing: Drawing) -> State:
-    scans = drawing.scans
+    kept = drawing.kept()
+    scans = [scan for scan in drawing.scans if scan is not None]
     return {
         **grid_state("grid", drawing.grid),
         **grid_state("base", drawing.base),
@@ -179,9 +181,12 @@ def drawing_state(drawing: Drawing) -> State:
         "drawn.poses": drawing.poses,
         "drawn.oldest": drawing.oldest,
         "drawn.redrawn": drawing.redrawn,
-        "drawn.sizes": np.array([len(s.points_m) for s in scans], np.int64),
-        "drawn.points_m": np.vstack([np.empty((0, 2), np.float32), *(s.points_m for s in scans)]).astype(np.float32),
-        "drawn.is_hit": np.concatenate([np.empty(0, bool), *(s.is_hit for s in scans)]).astype(bool),
+        "drawn.thin_at": drawing.thin_at,
+        "drawn.kept": np.array(kept, np.int64),
+        "drawn.sizes": np.array([len(s.ends) for s in scans], np.int64),
+        "drawn.ends": np.vstack([np.empty((0, 2), np.int16), *(s.ends for s in scans)]),
+        "drawn.unit_m": np.array([s.unit_m for s in scans]),
+        "drawn.hit_bits": np.concatenate([np.empty(0, np.uint8), *(s.hit_bits for s in scans)]),
         "drawn.is_partial": np.array([s.is_partial for s in scans], bool),
         "fresh.poses": -1 if drawing.fresh is None else len(drawing.fresh.poses),
         "fresh.target": drawing.target,
@@ -220,7 +225,7 @@ def put_state(mapper: Mapper, state: State) -> None:
         state["keyframe_s"],
         state["keyframe_variance"],
     )
-    local.scans = [(s, int(k), x, y, theta) for s, k, x, y, theta in state["scans"].tolist()]
+    local.scans.rows = state["scans"]
     put_filter(mapper, state)
     put_drawing(local.drawing, state)
     put_loops(local.loops, state)
@@ -261,13 +266,22 @@ def put_drawing(drawing: Drawing, state: State) -> None:
     put_grid(drawing.base, "base", state)
     drawing.coarse.empty, drawing.coarse.first = state["coarse.empty"], state["coarse.first"]
     drawing.poses, drawing.oldest, drawing.redrawn = state["drawn.poses"], state["drawn.oldest"], state["drawn.redrawn"]
-    if len(state["drawn.sizes"]):
-        ends = np.cumsum(state["drawn.sizes"])[:-1]
-        points, hits = np.split(state["drawn.points_m"], ends), np.split(state["drawn.is_hit"], ends)
-        drawing.scans = [DrawnScan(p, h, bool(b)) for p, h, b in zip(points, hits, state["drawn.is_partial"], strict=True)]
+    drawing.thin_at, drawing.scans = state["drawn.thin_at"], [None] * len(drawing.poses)
+    put_kept(drawing, state)
     if state["fresh.poses"] >= 0:
         drawing.resume(state["fresh.target"], state["fresh.poses"], state["fresh.is_bent"])
     drawing.correction = state["drawn.correction"]
+
+
+def put_kept(drawing: Drawing, state: State) -> None:
+    sizes = state["drawn.sizes"]
+    ends, bits = (
+        np.split(state[name], np.cumsum(n)[:-1]) for name, n in (("drawn.ends", sizes), ("drawn.hit_bits", -(-sizes // 8)))
+    )
+    rows = zip(state["drawn.kept"].tolist(), ends, state["drawn.unit_m"].tolist(), bits, state["drawn.is_partial"], strict=True)
+    for k, one_ends, unit_m, one_bits, is_partial in rows if len(sizes) else ():
+        # Each its own, or the scans that are let go later would stay with the others.
+        drawing.scans[k] = KeptScan(one_ends.copy(), unit_m, one_bits.copy(), bool(is_partial))
 
 
 def put_grid(grid: LogOddsGrid, name: str, state: State) -> None:

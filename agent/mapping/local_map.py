@@ -21,9 +21,9 @@ from agent.mapping.redrawing import Drawing
 from agent.mapping.relocalization import Relocalization
 from agent.mapping.scan_points import ScanPoints
 from agent.mapping.tracking import Tracked, track
+from agent.mapping.trajectory import Trajectory
 from protocol.geometry import SE2, wrap_angle
 
-KEPT_SCANS = 100_000  # of the trajectory: three hours at 10 Hz
 UNKNOWN_MOTION = (0.5, 0.4)  # one sigma, metres and radians, when odometry says nothing
 
 
@@ -40,7 +40,7 @@ class LocalMap:
         self.keyframe_pose = np.zeros(3)  # the followed particle's pose when it last drew
         self.keyframe_s = math.nan
         self.keyframe_variance = np.zeros(2)  # of the motion since then
-        self.scans: list[tuple[float, int, float, float, float]] = []  # stamp, keyframe, pose relative to that keyframe
+        self.scans = Trajectory()
 
     @property
     def is_empty(self) -> bool:
@@ -70,9 +70,7 @@ class LocalMap:
         """The robot is here now."""
         self.pose, self.last_scan_s = pose, stamp_s
         relative = as_pose(self.keyframe_pose).inverse() @ as_pose(pose)
-        if len(self.scans) >= KEPT_SCANS:
-            del self.scans[: KEPT_SCANS // 2]
-        self.scans.append((stamp_s, len(self.filter.line) - 1, relative.x_m, relative.y_m, relative.theta_rad))
+        self.scans.add(stamp_s, len(self.filter.line) - 1, relative)
 
     def note_motion(self, motion: Motion) -> None:
         """Uncertainty grows with what the wheels say."""
@@ -83,8 +81,9 @@ class LocalMap:
         """Without wheels: as fast as between the last two scans."""
         if len(self.scans) < 2:
             return Motion(SE2.identity(), is_known=False)
-        (before_s, *_), (last_s, *_) = self.scans[-2:]
-        before, last = (as_pose(self.filter.line[k]) @ SE2(*relative) for _, k, *relative in self.scans[-2:])
+        two = self.scans.rows[-2:].tolist()
+        (before_s, *_), (last_s, *_) = two
+        before, last = (as_pose(self.filter.line[int(k)]) @ SE2(*relative) for _, k, *relative in two)
         step = before.inverse() @ last
         share = (stamp_s - last_s) / max(last_s - before_s, 1e-3)
         if share > 3.0:
@@ -138,12 +137,7 @@ class LocalMap:
 
     def trajectory(self) -> NDArray[np.float64]:
         """(N, 4) stamp, x, y, theta at every accepted scan, as the followed particle remembers it now."""
-        scans = np.array(self.scans).reshape(-1, 5)
-        frames = self.filter.line[scans[:, 1].astype(np.int64)]
-        cos, sin = np.cos(frames[:, 2]), np.sin(frames[:, 2])
-        x = frames[:, 0] + cos * scans[:, 2] - sin * scans[:, 3]
-        y = frames[:, 1] + sin * scans[:, 2] + cos * scans[:, 3]
-        return np.stack([scans[:, 0], x, y, frames[:, 2] + scans[:, 4]], axis=1)
+        return self.scans.placed(self.filter.line)
 
 
 def as_pose(xyt: NDArray[np.float64]) -> SE2:

@@ -70,7 +70,7 @@ class LoopCloser:
         self.next_look = len(line) + SHORT_PAUSE
         way = way_m(line)
         local = recent(way)
-        old = self._candidate(line, way, local, drawing.oldest)
+        old = self._candidate(line, way, local, np.array(drawing.kept(), np.int64) + drawing.oldest)
         if old is None:
             return None
         given = around(old, way, drawing.oldest, local.start)
@@ -89,21 +89,20 @@ class LoopCloser:
             LoopEdge(old, middle, pose_of(line[old]).inverse() @ T_given_local @ pose_of(line[middle])), drawing, line
         )
 
-    def _candidate(self, line: Poses, way: NDArray[np.float64], local: range, oldest: int) -> int | None:
-        """The nearest old keyframe that the robot may be back at; after a miss the next one."""
+    def _candidate(self, line: Poses, way: NDArray[np.float64], local: range, kept: NDArray[np.int64]) -> int | None:
+        """The nearest old keyframe, of those kept, that the robot may be back at; after a miss the next one."""
         here = local[len(local) // 2]
-        end = int(np.searchsorted(way, way[local.start] - SHORTEST_LOOP_M))
-        if end <= oldest:
-            return None
-        since_m = np.minimum(way[here] - way[oldest:end], way[here] - way[min(self.known, here)])
+        old = kept[way[kept] < way[local.start] - SHORTEST_LOOP_M]
+        since_m = np.minimum(way[here] - way[old], way[here] - way[min(self.known, here)])
         reach_m = np.minimum(REACH_M + REACH_A_METRE * since_m, LARGEST_REACH_M)
-        away_m = np.hypot(*(line[oldest:end, :2] - line[here, :2]).T)
+        away_m = np.hypot(*(line[old, :2] - line[here, :2]).T)
+        old = old[np.argsort(np.where(away_m <= reach_m, away_m, np.inf), kind="stable")][: np.count_nonzero(away_m <= reach_m)]
         places: list[int] = []
-        for k in np.argsort(away_m, kind="stable"):
-            if away_m[k] > reach_m[k] or len(places) > self.misses % 4:
-                continue
-            if all(abs(way[k + oldest] - way[p]) > SHORTEST_LOOP_M / 2 for p in places):
-                places.append(int(k) + oldest)
+        for k in old.tolist():
+            if len(places) > self.misses % 4:
+                break
+            if all(abs(way[k] - way[p]) > SHORTEST_LOOP_M / 2 for p in places):
+                places.append(k)
         return places[self.misses % len(places)] if places else None
 
     def _remember(self, edge: LoopEdge) -> None:

@@ -29,7 +29,8 @@ WEIGHT_GAIN = 0.03  # of each point's log-likelihood; stronger gains kill the ri
 SPREAD_GAIN = 0.02  # of the fit's covariance, when drawing around the mode
 PREDICTION_NOISE = np.array([0.01, 0.01, 0.004])  # metres, metres, radians: what keeps the particles apart
 CLEARLY_LIKELIER = 1.0  # in log-weight: the drawn map should not flip between particles that are as good
-KEPT_KEYFRAMES = 4096  # particles agree on what lies further back than half of this
+AGREED_EVERY = 64  # keyframes: then the path that all particles share is fixed, and only the followed one kept
+KEPT_KEYFRAMES = 4096  # ... and half of this when they still do not agree
 RESAMPLE_BELOW = 0.5  # effective particles, as a share of all
 USUAL_SPREAD_M = 0.05  # one sigma of where the particles stand, above which more than the usual number are wanted
 SETTLED_M = 0.01  # ... and below which fewer will do; at 0.05, freiburg-079 was lost on two seeds of eight
@@ -53,8 +54,8 @@ class ParticleFilter:
         self.parents: list[Numbers] = []  # particle i of keyframe k came from particle parents[k][i] of k - 1
         self.next_parents: Numbers = np.arange(particles, dtype=np.uint16)
         self.followed = 0  # the particle that is tracked and drawn
-        self.lineage: list[int] = []  # its ancestor at every keyframe ...
-        self.line: Poses = np.empty((0, 3))  # ... and where that one was
+        self.lineage: list[int] = []  # its ancestor at every keyframe of the path ...
+        self.line: Poses = np.empty((0, 3))  # ... and where that one was, at every keyframe of all
         self.forgotten = 0  # keyframe number of path[0]: nobody turns back further than that
 
     @property
@@ -147,13 +148,27 @@ class ParticleFilter:
         self.line = np.vstack([self.line, self.path[-1][particle]])
         for k in range(len(self.path) - 2, -1, -1):
             particle = int(self.parents[k + 1][particle])
-            if self.lineage[k + self.forgotten] == particle:
+            if self.lineage[k] == particle:
                 break
-            self.lineage[k + self.forgotten] = particle
+            self.lineage[k] = particle
             self.line[k + self.forgotten] = self.path[k][particle]
+        if len(self.line) % AGREED_EVERY == 0:
+            self._forget(self._agreed())
         if len(self.path) > KEPT_KEYFRAMES:
-            del self.path[: KEPT_KEYFRAMES // 2], self.parents[: KEPT_KEYFRAMES // 2]
-            self.forgotten += KEPT_KEYFRAMES // 2
+            self._forget(KEPT_KEYFRAMES // 2)
+
+    def _agreed(self) -> int:
+        """How many keyframes lie before the newest one at which all particles have the same ancestor."""
+        ancestors = np.unique(self.next_parents)
+        for k in range(len(self.path) - 1, 0, -1):
+            if len(ancestors) == 1:
+                return k
+            ancestors = np.unique(self.parents[k][ancestors])
+        return 0
+
+    def _forget(self, keyframes: int) -> None:
+        del self.path[:keyframes], self.parents[:keyframes], self.lineage[:keyframes]
+        self.forgotten += keyframes
 
     def adopt(self, line: Poses, field: TiledFields) -> None:
         """A loop was closed: `line` (K, 3) is what everybody remembers now, and `field`, of one particle, what they see."""
@@ -163,7 +178,7 @@ class ParticleFilter:
         self.path = [pose[None] for pose in line[self.forgotten :]]
         self.parents = [np.zeros(1, np.uint16) for _ in self.path]
         self.next_parents = np.zeros(self.particles, np.uint16)
-        self.lineage = [0] * len(line)
+        self.lineage = [0] * len(self.path)
         self.fields.put(np.repeat(field.tables, self.particles, axis=0), field.pool, field.first_tile)
 
 

@@ -7,12 +7,11 @@ loop bends the path of all particles: then their field is stamped again, too.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from agent.mapping.correlation import CoarseField
+from agent.mapping.kept_scans import FEWEST_TO_THIN, THIN_AGAIN, KeptScan, needless
 from agent.mapping.likelihood import TiledFields
 from agent.mapping.log_odds import LogOddsGrid
 from agent.mapping.options import MappingOptions
@@ -26,16 +25,7 @@ REDRAW_M = 0.05  # a past that moved by a cell is drawn again; less is left to t
 REDRAW_RAD = 0.01
 SCANS_A_CALL = 20  # about 10 ms at 360 beams
 BENT_SCANS_A_CALL = 40  # a bent map is wanted soon
-KEPT_SCANS = 20_000  # 4 hours of driving, 40 to 80 MB; older scans stay on the grid as they were last drawn
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DrawnScan:
-    """What drawing a keyframe again needs."""
-
-    points_m: NDArray[np.float32]  # (N, 2) ray ends, robot frame
-    is_hit: NDArray[np.bool_]  # (N,)
-    is_partial: bool
+KEPT_BYTES = 16_000_000  # of scans: 10,000 places at 360 beams; beyond, the older half stays as it was last drawn
 
 
 class Drawing:
@@ -45,9 +35,10 @@ class Drawing:
         self.options = options
         self.grid = new_grid(options)
         self.coarse = CoarseField()
-        self.scans: list[DrawnScan] = []
+        self.scans: list[KeptScan | None] = []  # None: its place is seen by others
         self.poses: Poses = np.empty((0, 3))
         self.oldest = 0  # keyframe number of scans[0]
+        self.thin_at = FEWEST_TO_THIN  # scans kept
         self.base = new_grid(options)  # keyframes before `oldest`, drawn for good
         self.fresh: Drawing | None = None  # a drawing in progress, of the first len(fresh.poses) keyframes
         self.target: Poses = np.empty((0, 3))  # where its keyframes are drawn from
@@ -61,18 +52,28 @@ class Drawing:
 
     def add(self, points: ScanPoints, pose: NDArray[np.float64]) -> None:
         """A new keyframe."""
-        scan = DrawnScan(points.points_m, points.is_hit, points.is_partial)
+        scan = KeptScan.of(points)
         self.scans.append(scan)
         self._draw(scan, pose)
 
-    def _draw(self, scan: DrawnScan, pose: NDArray[np.float64]) -> None:
+    def scan_of(self, keyframe: int) -> KeptScan | None:
+        """What was seen from a keyframe, where it is kept."""
+        return self.scans[keyframe - self.oldest] if keyframe >= self.oldest else None
+
+    def kept(self) -> list[int]:
+        """Numbers, counted from the oldest, of the keyframes whose scans are kept."""
+        return [k for k, scan in enumerate(self.scans) if scan is not None]
+
+    def _draw(self, scan: KeptScan | None, pose: NDArray[np.float64]) -> None:
+        self.poses = np.vstack([self.poses, pose])
+        if scan is None:
+            return
         draw(self.grid, self.options, scan, pose)
         ends = SE2(float(pose[0]), float(pose[1]), float(pose[2])).apply(scan.points_m[scan.is_hit])
         if len(ends):
             self.coarse.stamp(ends.astype(np.float32))
         if self.field is not None and len(ends):
             stamp_surface(self.field, self.options, scan, pose)
-        self.poses = np.vstack([self.poses, pose])
 
     def follow(self, path: Poses) -> TiledFields | None:
         """Draw a few scans of what has to be drawn again so that the grid shows `path`, (K, 3) poses of all keyframes.
@@ -84,7 +85,8 @@ class Drawing:
             self.fresh, self.target = self._blank(), path
         if self.fresh is not None:
             field = self._continue(self.fresh, path)
-        self._forget_oldest()
+        if self.fresh is None:
+            self._forget()
         return field
 
     def bend(self, bent: Poses, path: Poses) -> None:
@@ -129,23 +131,35 @@ class Drawing:
         self.redrawn += 1
         return fresh.field
 
-    def _forget_oldest(self) -> None:
-        """Beyond KEPT_SCANS the older half becomes part of the base."""
-        if len(self.scans) <= KEPT_SCANS or self.fresh is not None:
+    def _forget(self) -> None:
+        """A few scans a place are kept; where that is more than KEPT_BYTES, the older half becomes part of the base."""
+        kept = self.kept()
+        if len(kept) < self.thin_at:
             return
-        half = len(self.scans) // 2
+        for k in needless(self.poses, kept):
+            self.scans[k] = None
+        if sum(scan.nbytes for scan in self.scans if scan is not None) > KEPT_BYTES:
+            self._draw_for_good()
+        self.thin_at = max(FEWEST_TO_THIN, int(THIN_AGAIN * len(self.kept())))
+
+    def _draw_for_good(self) -> None:
+        """The older half of what is kept becomes part of the base."""
+        kept = self.kept()
+        half = kept[len(kept) // 2]
         for scan, pose in zip(self.scans[:half], self.poses[:half], strict=True):
-            draw(self.base, self.options, scan, pose)
+            if scan is not None:
+                draw(self.base, self.options, scan, pose)
         del self.scans[:half]
         self.poses = self.poses[half:]
         self.oldest += half
 
 
-def stamp_surface(field: TiledFields, options: MappingOptions, scan: DrawnScan, pose: NDArray[np.float64]) -> None:
+def stamp_surface(field: TiledFields, options: MappingOptions, scan: KeptScan, pose: NDArray[np.float64]) -> None:
     """What one keyframe adds to the field of a particle."""
     laser = np.array(laser_position_m(options, SE2.identity()))
-    ranges_m = np.hypot(*(scan.points_m - laser).T).astype(np.float64)
-    x, y, _, _ = placed(pose[None], surface_points(scan.points_m, scan.is_hit, ranges_m))
+    points_m = scan.points_m
+    ranges_m = np.hypot(*(points_m - laser).T).astype(np.float64)
+    x, y, _, _ = placed(pose[None], surface_points(points_m, scan.is_hit, ranges_m))
     stamp_all(field, np.stack([x[0], y[0]], axis=1))
 
 
@@ -160,7 +174,7 @@ def new_grid(options: MappingOptions) -> LogOddsGrid:
     return LogOddsGrid(options.resolution_m, options.occupied_above, options.free_below)
 
 
-def draw(grid: LogOddsGrid, options: MappingOptions, scan: DrawnScan, pose: NDArray[np.float64]) -> None:
+def draw(grid: LogOddsGrid, options: MappingOptions, scan: KeptScan, pose: NDArray[np.float64]) -> None:
     """One keyframe on a grid."""
     T_map_robot = SE2(float(pose[0]), float(pose[1]), float(pose[2]))
     laser_m = laser_position_m(options, T_map_robot)

@@ -49,7 +49,8 @@ def grid_of(drawing: Drawing, keyframes: range, line: Poses) -> OccupancyGrid:
     """A stretch alone, drawn in the map frame."""
     grid = new_grid(drawing.options)
     for k in keyframes:
-        draw(grid, drawing.options, drawing.scans[k - drawing.oldest], line[k])
+        if (scan := drawing.scan_of(k)) is not None:
+            draw(grid, drawing.options, scan, line[k])
     return grid.trinary()
 
 
@@ -57,7 +58,8 @@ def points_of(drawing: Drawing, keyframes: range, line: Poses) -> NDArray[np.flo
     """(N, 2) some of what a stretch saw, map frame."""
     points = [np.empty((0, 2))]
     for k in keyframes:
-        scan = drawing.scans[k - drawing.oldest]
+        if (scan := drawing.scan_of(k)) is None:
+            continue
         hits = scan.points_m[scan.is_hit]
         hits = hits[np.hypot(hits[:, 0], hits[:, 1]) < RANGE_M]
         points.append(SE2(*map(float, line[k])).apply(hits[:: len(hits) // POINTS_A_SCAN + 1]))

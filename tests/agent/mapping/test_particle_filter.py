@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
+from agent.mapping import particle_filter
 from agent.mapping.likelihood import AREA, TiledFields
 from agent.mapping.mapper import Mapper
 from agent.mapping.options import MappingOptions
@@ -102,3 +104,21 @@ def test_the_followed_line_is_the_path_of_ancestors() -> None:
         expected.append(particles.path[k][particle])
         particle = int(particles.parents[k][particle])
     assert np.array_equal(particles.line, np.array(expected[::-1]))
+
+
+def test_what_all_particles_agree_on_is_forgotten_and_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    wall = np.stack([np.linspace(-1, 1, 41), np.full(41, 1.0)], axis=1).astype(F32)
+    surfels = np.column_stack([wall, np.zeros(41), np.ones(41)]).astype(F32)
+    lines = []
+    for agreed_every in (3, 10_000):
+        monkeypatch.setattr(particle_filter, "AGREED_EVERY", agreed_every)
+        particles = ParticleFilter(6, 0.05, np.random.default_rng(0))
+        particles.start(wall)
+        for k in range(30):
+            if k % 7 == 3:
+                particles.log_weights[np.arange(particles.particles) != k % particles.particles] = -9.0
+            particles.update(np.array([0.01, 0.0, 0.0]), (0.02, 0.01), surfels, wall)
+        lines.append(particles.line)
+        assert len(particles.path) == len(particles.lineage) == 31 - particles.forgotten
+        assert (particles.forgotten > 20) == (agreed_every == 3)
+    assert np.array_equal(*lines)
