@@ -37,12 +37,12 @@ class PairChoice:
     def __init__(self, ledger: Ledger, words: PairWords) -> None:
         self._ledger, self._words = ledger, words
         self._tokens, self._tokens_s = float(ledger.options.strangers_at_once), 0.0
-        self._least_promise = 0.0  # of a stranger that is looked at now
+        self._promising: set[str] | None = None  # strangers to be looked at now; None: whoever has its turn
 
     def next(self, peers: list[Peer], now_s: float) -> tuple[Peer, Due] | None:
         """Update what each pair waits for; the most urgent comparison, of equals the one that has waited longest."""
         self._refill(now_s)
-        self._least_promise = self._promise_of_the_best() if len(peers) < len(self._ledger.peers) else 0.0
+        self._promising = self._most_promising() if len(peers) < len(self._ledger.peers) else None
         ordered = sorted(peers, key=lambda peer: -self._promise(peer))
         options = [(peer, due) for peer in ordered if (due := self._option(peer, now_s)) is not None]
         return min(options, key=lambda option: self._rank(*option), default=None)
@@ -125,19 +125,17 @@ class PairChoice:
 
     def _may_court(self, pair: Pair) -> bool:
         """Strangers are looked at a few a minute: in a fleet of a thousand nobody can look at everybody at once."""
-        if not pair.is_courted and self._tokens >= 1.0 and pair.promise >= self._least_promise:
+        is_wanted = self._promising is None or pair.peer in self._promising
+        if not pair.is_courted and is_wanted and self._tokens >= 1.0:
             self._tokens -= 1.0
             pair.is_courted = True
         return pair.is_courted
 
-    def _promise_of_the_best(self) -> float:
-        """What a stranger must promise to be among those we may look at now: the best of all, not of the few whose turn it is."""
-        count = int(self._tokens)
-        if count == 0:
-            return 0.0
+    def _most_promising(self) -> set[str]:
+        """As many as may be looked at now: the best of all strangers, not of the few whose turn it is."""
         strangers = [peer for peer in self._ledger.peers.values() if not self._words.pair(peer.robot).is_courted]
-        promises = [self._promise(peer) for peer in strangers if self._may_propose(peer)]
-        return min(heapq.nlargest(count, promises), default=0.0)
+        hopeful = [peer for peer in strangers if self._may_propose(peer)] if self._tokens >= 1.0 else []
+        return {peer.robot for peer in heapq.nlargest(int(self._tokens), hopeful, key=self._promise)}
 
     def _refill(self, now_s: float) -> None:
         options = self._ledger.options

@@ -187,10 +187,10 @@ def test_a_table_full_of_strangers_stays_bounded() -> None:
 
 
 def test_in_a_fleet_larger_than_one_turn_the_most_alike_is_looked_at_first() -> None:
-    coordinator, explorer = Coordinator("r0", 1), Explorer.at(WORLD, PLACES[0], 0.0)
+    coordinator, explorer = Coordinator("r0", 1, FleetOptions(strangers_at_once=4)), Explorer.at(WORLD, PLACES[0], 0.0)
     explorer.look(PLACES[0], 12)
     rng = np.random.default_rng(1)
-    ours, *others = (FeatureMap(lines=rng.uniform(1.0, 15.0, (20, 6)).astype(np.float32)) for _ in range(151))
+    ours, *others = (FeatureMap(lines=rng.uniform(1.0, 90.0, (5, 6)).astype(np.float32)) for _ in range(151))
     coordinator.on_local_map(explorer, ours, 0.0)
     for i, features in enumerate([*others, ours]):
         version = MapVersion(i + 1, 1, bytes([i]) * 16)
