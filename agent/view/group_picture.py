@@ -12,27 +12,36 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.view.merge_picture import (
-    CONFLICT,
+from agent.view.canvas import Canvas
+from agent.view.render import robot_colour
+from agent.view.sheet import (
     FAINT,
     GAP,
     INK,
+    KNOWN_FREE,
     PAPER,
+    RED,
     UNKNOWN,
     WIDTH,
-    Canvas,
     Colour,
     Image,
     centred,
     heading,
+    in_a_row,
+    legend,
+    stacked,
     write,
 )
-from agent.view.render import robot_colour
 from protocol.grid import FREE, OCCUPIED, OccupancyGrid
 
 A_ROW = 4  # maps side by side
 SEVERAL: Colour = INK
-KNOWN_FREE: Colour = (255, 255, 255)
+CONFLICT: Colour = RED
+LEGEND = (
+    ((SEVERAL,), "several maps agree"),
+    ((CONFLICT,), "they conflict: unknown in the merged map"),
+    ((UNKNOWN,), "unknown"),
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,22 +60,15 @@ def group_picture(members: Sequence[Member], fused: OccupancyGrid, conflicts: ND
     strips = [_strip(members, first) for first in range(0, len(members), A_ROW)]
     canvas = Canvas.fitting(fused, WIDTH - 2 * GAP, max_height=1100)
     canvas.paint(_together(members, fused, conflicts))
-    gap = np.full((GAP, WIDTH, 3), PAPER, np.uint8)
-    parts = [heading(verdict, figures), *strips, _legend(), centred(canvas.image, WIDTH)]
-    return np.vstack([piece for part in parts for piece in (gap, part)] + [gap])
+    meaning = legend(LEGEND, "a map's own colour: it alone knows this wall")
+    return stacked([heading(verdict, figures), *strips, meaning, centred(canvas.image, WIDTH)])
 
 
 def _strip(members: Sequence[Member], first: int) -> Image:
     """A row of maps, each under its name and colour."""
     across = min(A_ROW, len(members))
     width = (WIDTH - (across + 1) * GAP) // across
-    panels = [_panel(member, first + i, width) for i, member in enumerate(members[first : first + A_ROW])]
-    height = max(panel.shape[0] for panel in panels)
-    sheet = np.full((height, WIDTH, 3), PAPER, np.uint8)
-    for i, panel in enumerate(panels):
-        x = GAP + i * (width + GAP)
-        sheet[: panel.shape[0], x : x + width] = panel
-    return sheet
+    return in_a_row([_panel(member, first + i, width) for i, member in enumerate(members[first : first + A_ROW])])
 
 
 def _panel(member: Member, index: int, width: int) -> Image:
@@ -95,18 +97,3 @@ def _together(members: Sequence[Member], fused: OccupancyGrid, conflicts: NDArra
     colours[(fused.cells == OCCUPIED) & (near > 1)] = SEVERAL
     colours[conflicts] = CONFLICT
     return colours
-
-
-def _legend() -> Image:
-    strip = np.full((26, WIDTH, 3), PAPER, np.uint8)
-    x = GAP
-    for colour, text in (
-        (SEVERAL, "several maps agree"),
-        (CONFLICT, "they conflict: unknown in the merged map"),
-        (UNKNOWN, "unknown"),
-    ):
-        cv2.rectangle(strip, (x, 5), (x + 17, 21), colour, -1)
-        write(strip, text, x + 26, 18, 0.48, INK)
-        x += 26 + cv2.getTextSize(text, cv2.FONT_HERSHEY_DUPLEX, 0.48, 1)[0][0] + 30
-    write(strip, "a map's own colour: it alone knows this wall", x, 18, 0.48, FAINT)
-    return strip

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from agent.view.sheet import GAP
 from protocol.features import ARC_COLUMNS, CIRCLE_COLUMNS, CURVE_COLUMNS, LINE_COLUMNS
 from tests.agent.commands.conftest import Run, floor_plan
 
@@ -62,9 +63,10 @@ def test_the_picture_shows_lines_where_walls_are(method: str, run: Run, office: 
     ended = run("features", office, "-o", tmp_path / "new" / "figure.png", "--method", method)
     assert ended.err == f"wrote {tmp_path}/new/figure.png\n"
     picture = cv2.imread(str(tmp_path / "new" / "figure.png")).astype(int)
-    assert picture.shape == (960, 1600, 3)
-    blue = (picture[:, :, 0] > 150) & (picture[:, :, 2] < 60)
-    wall = cv2.resize((floor_plan().cells[::-1] == 100).astype(np.uint8), (1600, 960)) > 0
+    drawn = picture[-GAP - 931 : -GAP, GAP:-GAP]  # below the legend
+    assert drawn.shape == (931, 1552, 3)
+    blue = (drawn[:, :, 0] > 150) & (drawn[:, :, 2] < 60)
+    wall = cv2.resize((floor_plan().cells[::-1] == 100).astype(np.uint8), (1552, 931)) > 0
     near_wall = cv2.dilate(wall.astype(np.uint8), np.ones((41, 41), np.uint8)) > 0
     assert blue.sum() > 5000
     assert (blue & near_wall).sum() > 0.98 * blue.sum()

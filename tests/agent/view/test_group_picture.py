@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from agent.view.group_picture import A_ROW, SEVERAL, Member, group_picture
-from agent.view.merge_picture import CONFLICT, FAINT, WIDTH
+from agent.view.group_picture import A_ROW, CONFLICT, SEVERAL, Member, group_picture
 from agent.view.render import robot_colour
+from agent.view.sheet import FAINT, WIDTH
 from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 SIDE = 60

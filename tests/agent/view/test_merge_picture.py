@@ -13,11 +13,11 @@ from agent.view.merge_picture import (
     OURS_FREE,
     THEIRS,
     THEIRS_FREE,
-    WIDTH,
     MapToDraw,
     Overlay,
     merge_picture,
 )
+from agent.view.sheet import WIDTH
 from protocol.features import FeatureMap
 from protocol.geometry import SE2
 from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
