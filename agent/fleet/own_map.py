@@ -99,10 +99,11 @@ class OwnMap:
         self.tiles: TileMap | None = None
         self.grid: OccupancyGrid | None = None  # what peers can know of it: exactly `tiles.grid()`
         self.known_area_m2 = 0.0
+        self.pinned = b""  # digest of the version that the composer's recipe uses: somebody may pull it yet
         self.announcement: MapAnnouncement | None = None
         self.blobs = Blobs(robot, boot)
         self._history = History()
-        self._versions: OrderedDict[bytes, MapVersion] = OrderedDict()
+        self._versions: dict[bytes, MapVersion] = {}  # of everything in the history
         self._answers: OrderedDict[tuple[str, bytes, bytes], bytes] = OrderedDict()
         self._coarse: CoarseMap | None = None
         self._counted_bytes = self._counted_tiles = 0
@@ -117,10 +118,8 @@ class OwnMap:
         self.version = MapVersion(frame, revision, tiles.digest)
         self.tiles, self.grid, self._coarse = tiles, tiles.grid(), None
         self.known_area_m2 = self.grid.known_area_m2()
-        self._history.add(tiles)
-        self._versions[tiles.digest] = self.version
-        while len(self._versions) > _KEPT_VERSIONS:
-            self._versions.popitem(last=False)
+        self._history.add(tiles, needed=self.pinned)
+        self._versions = {d: v for d, v in self._versions.items() if self._history.get(d)} | {tiles.digest: self.version}
         self.announcement = MapAnnouncement(
             self.robot,
             self.boot,

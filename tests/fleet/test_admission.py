@@ -8,10 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from protocol.features import FeatureMap
 from protocol.geometry import SE2
 from protocol.grid import FREE, OCCUPIED, OccupancyGrid
 from tests.fleet.attackers import Liar
 from tests.fleet.explorer import Explorer, random_world
+from tests.fleet.groups import fleet_of, names
 from tests.fleet.simulation import Fleet
 
 NAMES = ["r0", "r1", "r2"]
@@ -84,3 +86,36 @@ def test_a_map_that_denies_itself_is_quarantined_at_once(value: int) -> None:
     show(fleet, lambda grid: replace(grid, cells=np.full_like(grid.cells, value)))
     fleet.run_until(lambda: bool(events(fleet, "quarantined")), 5.0)
     fleet.run_until(lambda: fleet.agrees(["r0", "r2"]), 10.0)
+
+
+@pytest.mark.parametrize(("robots", "is_followed"), [(3, False), (5, True)])
+def test_a_robot_alone_with_its_doubt_follows_what_many_follow(robots: int, is_followed: bool) -> None:
+    """Refusals are judgements on noisy maps: with nobody else to ask they stand, against the many they yield."""
+    fleet, everybody = fleet_of(robots), names(robots)
+    fleet.run_until(lambda: fleet.agrees(everybody), 20.0)
+    doubter, doubted = everybody[-1], fleet.nodes["r1"]
+    admission = fleet.nodes[doubter].coordinator._admission  # type: ignore[union-attr]
+    believe = admission._is_believed
+    admission._is_believed = lambda peer, *args, **facts: peer.robot != "r1" and believe(peer, *args, **facts)  # type: ignore[method-assign]
+    assert doubted.explorer is not None
+    doubted.explorer.look(SE2(6, 6, 0.0), 12.0)
+    fleet.share_map(doubted)
+    fleet.run(40.0)
+    assert any(note.event == "held-back" for note in fleet.nodes[doubter].notes)
+    assert fleet.agrees(everybody) == is_followed
+
+
+@pytest.mark.parametrize("is_used", [True, False])
+def test_the_version_a_recipe_uses_can_be_pulled_however_long_ago_it_was(is_used: bool) -> None:
+    fleet = fleet_of(2)
+    fleet.run_until(lambda: fleet.agrees(names(2)), 20.0)
+    own = fleet.nodes["r1"].coordinator._ledger.own  # type: ignore[union-attr]
+    assert own.version is not None and own.grid is not None
+    used = own.pinned
+    assert used == own.version.digest
+    own.pinned = used if is_used else b""
+    for i in range(20):
+        cells = own.grid.cells.copy()
+        cells[0, i] = OCCUPIED
+        assert own.publish(replace(own.grid, cells=cells), FeatureMap(), own.version.frame)
+    assert (own.fine(b"", used) is not None) == is_used
