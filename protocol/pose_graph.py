@@ -8,7 +8,6 @@ squares, loses ten times as many good edges when a tenth of all is wrong.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 GATE = 16.0  # squared residual, in sigmas, above which an edge is wrong: 3 degrees of freedom, 0.1 %
 WRONG_WEIGHT = 1e-4  # keeps poses that only wrong edges reach from floating away
 STEPS = 30
+DAMPING = 1e-6  # frames whose every edge has weight 0 stay where they are
 DENSE_NODES = 120  # larger graphs are solved by conjugate gradients
 
 
@@ -103,7 +103,7 @@ class PoseGraph:
         np.add.at(gradient, self.ib, np.einsum("eji,ejk,ek->ei", jb, info, r))
         if n <= DENSE_NODES:
             hessian = dense_hessian(n, self.ia, self.ib, ja, jb, info)
-            hessian[np.arange(3 * n), np.arange(3 * n)] += 1e-6  # frames whose every edge has weight 0 stay where they are
+            hessian[np.arange(3 * n), np.arange(3 * n)] += DAMPING
             step = np.zeros((n, 3))
             step[1:] = -np.linalg.solve(hessian[3:, 3:], gradient[1:].ravel()).reshape(-1, 3)
             return step
@@ -113,7 +113,9 @@ class PoseGraph:
         self, target: NDArray[np.float64], ja: NDArray[np.float64], jb: NDArray[np.float64], info: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """(N, 3) step of a large group: the Hessian has few blocks, and only its product with a vector is needed."""
-        times, diagonal = _sparse_hessian(len(self.x), self.ia, self.ib, ja, jb, info)
+        rows, cols, values = hessian_entries(self.ia, self.ib, ja, jb, info)
+        is_diagonal = rows == cols
+        diagonal = DAMPING + np.bincount(rows[is_diagonal], values[is_diagonal], target.size)
         x, residual = np.zeros(target.size), target.ravel().copy()
         residual[:3] = 0.0
         z = residual / diagonal
@@ -122,7 +124,7 @@ class PoseGraph:
         for _ in range(400):
             if rz < enough:
                 break
-            hp = times(p)
+            hp = DAMPING * p + np.bincount(rows, values * p[cols], target.size)
             hp[:3] = 0.0
             alpha = rz / float(p @ hp)
             x += alpha * p
@@ -133,28 +135,20 @@ class PoseGraph:
         return x.reshape(-1, 3)
 
 
-def _sparse_hessian(
-    n: int,
+def hessian_entries(
     ia: NDArray[np.int64],
     ib: NDArray[np.int64],
     ja: NDArray[np.float64],
     jb: NDArray[np.float64],
     info: NDArray[np.float64],
-) -> tuple[Callable[[NDArray[np.float64]], NDArray[np.float64]], NDArray[np.float64]]:
-    """Product of the Hessian with a vector (3 N,), and its diagonal."""
-    blocks, rows, cols = [], [], []
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Row, column and value of what every edge adds to the Hessian: four blocks of 3 x 3."""
+    rows, cols, blocks = [], [], []
     for left, right, i, j in ((ja, ja, ia, ia), (ja, jb, ia, ib), (jb, ja, ib, ia), (jb, jb, ib, ib)):
-        blocks.append(np.einsum("eji,ejk,ekl->eil", left, info, right, optimize=True))
+        blocks.append(left.swapaxes(1, 2) @ info @ right)
         rows.append(np.broadcast_to((3 * i)[:, None, None] + np.arange(3)[:, None], blocks[-1].shape))
         cols.append(np.broadcast_to((3 * j)[:, None, None] + np.arange(3), blocks[-1].shape))
-    row, col, value = np.ravel(rows), np.ravel(cols), np.ravel(blocks)
-    is_diagonal = row == col
-    diagonal = np.asarray(1e-6 + np.bincount(row[is_diagonal], value[is_diagonal], 3 * n), np.float64)
-
-    def times(v: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(1e-6 * v + np.bincount(row, value * v[col], 3 * n))
-
-    return times, diagonal
+    return np.ravel(rows), np.ravel(cols), np.ravel(blocks)
 
 
 def dense_hessian(
@@ -166,7 +160,5 @@ def dense_hessian(
     info: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """(3 n, 3 n)."""
-    hessian = np.zeros((n, n, 3, 3))
-    for left, right, i, j in ((ja, ja, ia, ia), (ja, jb, ia, ib), (jb, ja, ib, ia), (jb, jb, ib, ib)):
-        np.add.at(hessian, (i, j), np.einsum("eji,ejk,ekl->eil", left, info, right))
-    return hessian.swapaxes(1, 2).reshape(3 * n, 3 * n)
+    rows, cols, values = hessian_entries(ia, ib, ja, jb, info)
+    return np.asarray(np.bincount(rows * (3 * n) + cols, values, 9 * n * n), np.float64).reshape(3 * n, 3 * n)
