@@ -23,6 +23,7 @@ from typing import Any, NoReturn
 from agent import __version__
 from agent.exits import BUG, EXIT_CODES, INTERRUPTED, OK, USAGE, CommandError
 
+os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # a broken picture is told once, by us
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when NumPy loads: our matrices are small, its idle threads spin
 
 COMMANDS: dict[str, tuple[str, str]] = {  # name: (module, what it does)

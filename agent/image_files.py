@@ -36,6 +36,8 @@ def load_image(path: Path) -> Pixels:
         return decode_pgm(data, path)
     if data[:8] == b"\x89PNG\r\n\x1a\n":
         return decode_png(data, path)
+    if not data:
+        raise ImageFileError(f"{path}: an empty file; was the disk full?")
     raise ImageFileError(f"{path}: neither PGM nor PNG (it starts with {data[:8]!r}); convert it: convert IN.jpg OUT.pgm")
 
 
@@ -61,6 +63,8 @@ def decode_png(data: bytes, where: object) -> Pixels:
     if len(data) < 33 or data[12:16] != b"IHDR":
         raise ImageFileError(f"{where}: a PNG without its header; is the file whole?")
     _check_size(where, int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big"))
+    if b"IEND" not in data[-4096:]:
+        raise ImageFileError(f"{where}: cut short: a PNG of {len(data)} bytes without its end")
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:

@@ -6,6 +6,7 @@ The LIDAR's place on the robot comes from /tf_static, when the bag has it.  No R
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +30,7 @@ def read_bag(path: Path, scan_topic: str | None = None, odometry_topic: str | No
         from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
     except ImportError as error:
         raise CommandError(
-            f"{path}: reading bags needs the package rosbags: .venv/bin/python -m pip install rosbags", ENVIRONMENT
+            f"{path}: reading bags needs the package rosbags: {sys.executable} -m pip install rosbags", ENVIRONMENT
         ) from error
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:

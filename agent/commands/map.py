@@ -29,7 +29,7 @@ from protocol.geometry import SE2
 
 EXAMPLES = """\
   mapquilt map intel.log.gz -o intel        intel.pgm and intel.yaml (nav2), intel.png, intel.tum (trajectory)
-  mapquilt map drive.mcap -o drive          rosbag2 and MCAP with LaserScan and Odometry: pip install 'mapquilt[rosbag]'
+  mapquilt map drive.mcap -o drive          rosbag2 and MCAP with LaserScan and Odometry: needs the package rosbags
   mapquilt map run.clf -o run --json        ... and figures as one JSON object
 """
 

@@ -73,7 +73,8 @@ class Merged:
         if len(self.maps) > 2:
             answer["maps"] = [self._map_json(i) for i in range(len(self.maps))]
             answer["pairs"] = [self._pair_json(pair) for pair in self.results]
-            answer["status"] = str(MatchStatus.MERGED) if self.is_complete else answer["status"]
+            answer["status"] = str(MatchStatus.MERGED if self.is_complete else MatchStatus.NO)
+            answer["reason"] = self.outcome()
         if self.fused is not None:
             answer["conflicting_cells"] = self.fused.conflicting_cells
             answer["agreeing_cells"] = self.fused.agreeing_cells
@@ -114,7 +115,15 @@ class Merged:
         return self.maps[i].grid.origin @ T_corners @ self.maps[j].grid.origin.inverse()
 
     def as_text(self) -> str:
-        return "\n".join(f"{self.verdict(pair)} ({', '.join(_figures(result))})" for pair, result in self.results.items())
+        lines = [f"{self.verdict(pair)} ({', '.join(_figures(result))})" for pair, result in self.results.items()]
+        return "\n".join([self.outcome(), *lines] if len(self.maps) > 2 else lines)
+
+    def outcome(self) -> str:
+        """One sentence about three maps and more."""
+        alone = [Path(loaded.name).name for i, loaded in enumerate(self.maps) if i not in self.T_first]
+        if len(self.T_first) == 1:
+            return f"nothing lies on {Path(self.maps[0].name).name}"
+        return f"{len(self.T_first)} of {len(self.maps)} maps are one" + (f"; not {', '.join(alone)}" if alone else "")
 
     def verdict(self, pair: Pair) -> str:
         """One sentence about a pair."""
@@ -124,7 +133,8 @@ class Merged:
         if pair in self.inconsistent:
             return f"not merged: {b} fits {a}, but contradicts the other maps"
         if result.accepted and T is not None:
-            where = f"x {T.x_m:.3f} m, y {T.y_m:.3f} m, {math.degrees(T.theta_rad):.2f} deg"
+            x_m, y_m, yaw_deg = (round(value, 3) + 0.0 for value in (T.x_m, T.y_m, math.degrees(T.theta_rad)))  # no -0
+            where = f"x {x_m:.3f} m, y {y_m:.3f} m, {yaw_deg:.2f} deg"
             return f"merged: {b} lies on {a} at {where}"
         kind = "ambiguous" if result.status is MatchStatus.AMBIGUOUS else "not merged"
         return f"{kind}: {b} on {a}: {result.reason}"

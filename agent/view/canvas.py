@@ -104,7 +104,9 @@ class Canvas:
         turns = np.linspace(from_rad, from_rad + span_rad, 49)
         self.stroke(centre_m + radius_m * np.column_stack([np.cos(turns), np.sin(turns)]), colour, thickness)
         if label:
-            self.label_at(label, centre_m, colour)
+            outward = from_rad + span_rad / 2
+            away_m = radius_m + 14 * self.grid.resolution_m / self.scale
+            self.label_at(label, centre_m + away_m * np.array([math.cos(outward), math.sin(outward)]), colour)
 
     def curve(self, row: FeatureTable, colour: Colour, thickness: int, label: str = "") -> None:
         """A diamond at the centre of mass, with its orientation."""

@@ -201,7 +201,7 @@ def test_a_broken_yaml_says_what_is_wrong(change: tuple[str, str], said: str, tm
 @pytest.mark.parametrize(
     ("image", "said"),
     [
-        (b"", "neither PGM nor PNG"),
+        (b"", "an empty file"),
         (b"\xff\xd8\xff\xe0 a photograph", "convert it"),
         (b"P5 3 2", "no PGM header"),
         (b"P5 3 2 255\n12345", "cut short: 5 of 3x2 pixels"),
@@ -210,7 +210,8 @@ def test_a_broken_yaml_says_what_is_wrong(change: tuple[str, str], said: str, tm
         (b"P5 30000 30000 255\n", "30000x30000 pixels"),
         (b"P5 3 2 70000\n", "PGM maximum 70000"),
         (b"\x89PNG\r\n\x1a\n", "a PNG without its header"),
-        (b"\x89PNG\r\n\x1a\n\0\0\0\x0dIHDR" + struct.pack(">II", 3, 2) + b"\x08\0\0\0\0" + bytes(9), "cannot be decoded"),
+        (b"\x89PNG\r\n\x1a\n\0\0\0\x0dIHDR" + struct.pack(">II", 3, 2) + b"\x08\0\0\0\0" + bytes(9), "without its end"),
+        (b"\x89PNG\r\n\x1a\n\0\0\0\x0dIHDR" + struct.pack(">II", 3, 2) + bytes(14) + b"IEND", "cannot be decoded"),
         (b"\x89PNG\r\n\x1a\n\0\0\0\x0dIHDR" + struct.pack(">II", 30000, 30000) + b"\x08\0\0\0\0" + bytes(9), "30000x30000"),
     ],
 )

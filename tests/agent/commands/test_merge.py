@@ -117,6 +117,7 @@ def test_a_stranger_among_three_makes_the_answer_no_and_is_named(maps, capsys):
     assert code == 1
     assert answer["accepted"] is False
     assert [m["joined"] for m in answer["maps"]] == [True, True, False]
+    assert (answer["status"], answer["reason"]) == ("no", "2 of 3 maps are one; not other.yaml")
 
 
 @pytest.mark.parametrize("method", ["paper", "paper-guarded"])
