@@ -1,7 +1,8 @@
-"""Whether a composer's recipe is followed: it must say what our own edges say, and use no map that we refuse.
+"""Whether a composer's recipe is followed: it must say what our own edges say, and use no cells that we hold back.
 
-A refusal is a judgement about noisy maps, and each robot makes it on what it happened to see first; alone against many that
-follow the recipe it yields, so that one group ends with one map.
+Holding back is a judgement about noisy maps, and each robot makes it on what it happened to see first.  It counts against a
+recipe only among neighbours, whose next check of their edge settles it; and alone against many that follow the recipe it
+yields, so that one group ends with one map.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import math
 
 from agent.fleet.frame_graph import Group
-from agent.fleet.ledger import Ledger
+from agent.fleet.ledger import Ledger, pair_key
 from agent.fleet.state import Presence
 from protocol.geometry import wrap_angle
 from protocol.messages import GlobalMeta
@@ -34,7 +35,8 @@ def objection(ledger: Ledger, meta: GlobalMeta, group: Group) -> str:
         if T.distance_m(ours) > _FOLLOW_M or abs(wrap_angle(T.theta_rad - ours.theta_rad)) > _FOLLOW_RAD:
             return f"{member.robot} lies {T.distance_m(ours):.2f} m from where our edges put it"
         peer = ledger.peers.get(member.robot)
-        if peer is not None and member.map.digest in peer.refused:
+        is_neighbour = pair_key(ledger.robot, member.robot) in ledger.live
+        if peer is not None and is_neighbour and member.map.digest in peer.refused:
             refused.add(member.robot)
     if refused and not _is_outvoted(ledger, meta, group, refused):
         return f"with cells of {', '.join(sorted(refused))} that are held back here"
