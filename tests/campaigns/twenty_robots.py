@@ -51,7 +51,7 @@ def campaign(args: argparse.Namespace) -> dict[str, Any]:
                 merged_s = time.monotonic() - started
             time.sleep(1.0)
         if merged_s is not None:
-            agreed_s = seconds_to_one_digest(fleet, names)
+            agreed_s = fleet.seconds_to_one_map_at_rest(names)
             rss_mb = max(rss_mb, *(resident_mb(fleet.agents[name].process.pid) for name in names))
         total_mb = sum(own_share_mb(fleet.agents[name].process.pid) for name in names)
         statuses = [fleet.status(name) for name in names]
@@ -73,17 +73,6 @@ def campaign(args: argparse.Namespace) -> dict[str, Any]:
         "worker errors": sum(w["errors"] for status in statuses if status for w in status["workers"]),
         "largest inbox drops": max((status["network"]["inbox_dropped"] for status in statuses if status), default=0),
     }
-
-
-def seconds_to_one_digest(fleet: Fleet, names: list[str]) -> float | None:
-    """Maps stand still; how long until every robot holds the very same global map of all."""
-    for name in names:
-        fleet.agents[name].ask("pause")
-    try:
-        return fleet.until(lambda: fleet.agree(*names), 90.0, "one digest")
-    except AssertionError as error:
-        print(str(error)[:4000], file=sys.stderr)
-        return None
 
 
 if __name__ == "__main__":

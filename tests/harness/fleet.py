@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -116,6 +117,16 @@ class Fleet:
                 raise AssertionError(f"{what} did not come true within {within_s:.0f} s\n{self.explain()}")
             time.sleep(LOOK_EVERY_S)
         return time.monotonic() - started
+
+    def seconds_to_one_map_at_rest(self, names: Sequence[str], within_s: float = 90.0) -> float | None:
+        """Maps stand still; how long until every robot holds the very same global map of all.  None: not in time."""
+        for name in names:
+            self.agents[name].ask("pause")
+        try:
+            return self.until(lambda: self.agree(*names), within_s, "one global map at rest")
+        except AssertionError as error:
+            print(str(error)[:4000], file=sys.stderr)
+            return None
 
     def stays(self, condition: Callable[[], object], for_s: float, what: str = "the condition") -> None:
         """A condition holds all the time."""
