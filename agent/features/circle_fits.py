@@ -189,7 +189,7 @@ def _longest_runs(fits: Fits, tolerance: float) -> Fits:
     owner, circles = fits.owner[rows], len(fits.circles)
     away = fits.points_m[rows] - fits.circles[owner, :2]
     angle = np.arctan2(away[:, 1], away[:, 0])
-    order = np.argsort(angle + 7.0 * owner)  # more than a turn apart
+    order = np.lexsort((angle, owner))
     rows, angle = rows[order], angle[order]
     count = np.bincount(owner, minlength=circles)
     first = np.cumsum(count) - count
@@ -199,7 +199,7 @@ def _longest_runs(fits: Fits, tolerance: float) -> Fits:
     gap = angle[following] - angle
     gap[last] += math.tau
     is_break = gap > np.maximum(GAP_M / fits.circles[:, 2], math.radians(8))[owner]
-    is_break[np.argsort(gap + 7.0 * owner)[last]] = True
+    is_break[np.lexsort((gap, owner))[last]] = True
     cuts = np.bincount(owner[is_break], minlength=circles)
     earlier: NDArray[np.int64] = np.cumsum(is_break) - is_break
     base = np.cumsum(cuts) - cuts

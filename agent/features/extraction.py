@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from agent.features.curves import curve_table
 from agent.features.lines import WallLines, wall_lines
-from agent.features.round_walls import Arc, as_tables, find_arcs
+from agent.features.round_walls import Arc, ArcsOfPieces, as_tables, find_arcs
 from agent.features.wall_points import WallPoints, wall_points
 from agent.features.working import WorkingGrid
 from protocol.features import FeatureMap, FeatureTable
@@ -36,11 +36,13 @@ def extract_features(grid: OccupancyGrid) -> FeatureMap:
     if not working.occupied.any():
         return FeatureMap()
     walls = wall_points(working)
-    return feature_map(working, walls, wall_lines(walls, working.resolution_m), grid.origin)
+    return feature_map(working, walls, wall_lines(walls, working.resolution_m), grid.origin, {})
 
 
-def feature_map(working: WorkingGrid, walls: WallPoints, lines: WallLines, T_map_grid: SE2) -> FeatureMap:
-    """The same, from the wall points and lines that matching has made already."""
+def feature_map(
+    working: WorkingGrid, walls: WallPoints, lines: WallLines, T_map_grid: SE2, known_arcs: ArcsOfPieces
+) -> FeatureMap:
+    """The same, from the wall points and lines that matching has made already, and arcs of an earlier state of the map."""
     if not len(walls):
         return FeatureMap()
     cells_m = (walls.cells_rc[:, ::-1].astype(np.float64) + 0.5) * working.resolution_m  # (N, 2) grid frame
@@ -50,7 +52,7 @@ def feature_map(working: WorkingGrid, walls: WallPoints, lines: WallLines, T_map
     piece = _piece_numbers(walls.cells_rc[loose])
     sizeable = np.bincount(piece)[piece] * working.resolution_m >= MIN_PIECE_M
     loose, piece = loose[sizeable], piece[sizeable]
-    arcs = find_arcs(cells_m[loose], piece, working.resolution_m)
+    arcs = find_arcs(cells_m[loose], piece, working.resolution_m, known_arcs)
     on_arc = np.zeros(len(walls), np.bool_)
     on_arc[loose] = _explained(arcs, cells_m[loose], working.resolution_m)
     kept = _straight_lines(lines, arcs, working.resolution_m)

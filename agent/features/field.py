@@ -26,6 +26,7 @@ FINE_TOLERANCE_M = 0.25  # a wall this near is the same wall; also what a judge 
 COARSE_TOLERANCE_M = 0.35  # for candidates that are not refined yet
 EDGE_M = 0.45  # free space this near to the unknown may end at a wall that was not hit
 REACH_M = 0.80  # refinement pulls walls together from here
+SEEN_M = 1.5  # distances end here: nothing asks for more, and what is told of a place depends on what is near it only
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,7 +38,7 @@ class MatchField:
     nearest: NDArray[
         np.float32
     ]  # (H, W) index of the nearest wall point, -1 beyond REACH_M; float because cv2.remap takes no int32
-    distance_m: NDArray[np.float32]  # (H, W) to the nearest wall
+    distance_m: NDArray[np.float32]  # (H, W) to the nearest wall, at most `seen_m`
     wall_share: float  # of the cells that tell anything
     resolution_m: float
 
@@ -47,15 +48,31 @@ class MatchField:
         bins = direction_bins(walls.angles_rad, DIRECTION_BINS)
         direction = bins[np.maximum(nearest, 0)] if len(walls) else np.zeros(nearest.shape, np.uint8)
         no_wall = _away_from_walls(grid)
-        fine = np.where(distance_m <= max(FINE_TOLERANCE_M, 1.25 * grid.resolution_m), direction, no_wall)
-        return MatchField(
-            fine,
+        return MatchField.made_of(
+            np.where(distance_m <= max(FINE_TOLERANCE_M, 1.25 * grid.resolution_m), direction, no_wall),
             np.where(distance_m <= max(COARSE_TOLERANCE_M, 1.5 * grid.resolution_m), direction, no_wall),
             np.where(distance_m <= REACH_M, nearest, -1).astype(np.float32),
-            distance_m,
-            int(np.count_nonzero(fine < DIRECTION_BINS)) / max(1, int(np.count_nonzero(fine != UNKNOWN_BYTE))),
+            np.minimum(distance_m, np.float32(seen_m(grid.resolution_m))),
             grid.resolution_m,
         )
+
+    @staticmethod
+    def made_of(
+        fine: NDArray[np.uint8],
+        coarse: NDArray[np.uint8],
+        nearest: NDArray[np.float32],
+        distance_m: NDArray[np.float32],
+        resolution_m: float,
+    ) -> MatchField:
+        told = int(np.count_nonzero(fine != UNKNOWN_BYTE))
+        return MatchField(
+            fine, coarse, nearest, distance_m, int(np.count_nonzero(fine < DIRECTION_BINS)) / max(1, told), resolution_m
+        )
+
+
+def seen_m(resolution_m: float) -> float:
+    """How far what a field tells of a place depends on what is around it."""
+    return max(SEEN_M, 2.0 * resolution_m)
 
 
 def _away_from_walls(grid: WorkingGrid) -> NDArray[np.uint8]:

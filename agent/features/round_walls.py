@@ -46,6 +46,9 @@ class Arc:
         return near
 
 
+ArcsOfPieces = dict[bytes, tuple[Arc, ...]]  # by the cells of the piece: from one second to the next most stay as they are
+
+
 @dataclass(slots=True, eq=False)
 class _Piece:
     points_m: NDArray[np.float64]  # those that no arc explains yet
@@ -53,17 +56,22 @@ class _Piece:
     arcs: list[Arc] = field(default_factory=list)
 
 
-def find_arcs(points_m: NDArray[np.float64], piece: NDArray[np.int64], resolution_m: float) -> list[Arc]:
-    """Arcs among (N, 2) points, `piece[i]` numbering the connected piece that point i belongs to; the longest first."""
-    pieces = _largest(points_m, piece)
-    asked = pieces
+def find_arcs(points_m: NDArray[np.float64], piece: NDArray[np.int64], resolution_m: float, known: ArcsOfPieces) -> list[Arc]:
+    """Arcs among (N, 2) points, `piece[i]` numbering the connected piece that point i belongs to; the longest first.
+
+    What is known of an earlier state of the map is not asked again, and left as it is known now.
+    """
+    pieces = {p.points_m.tobytes(): p for p in _largest(points_m, piece)}
+    asked = [p for key, p in pieces.items() if key not in known]
     for _ in range(MAX_PER_PIECE):
         asked = [p for p in asked if len(p.points_m) >= MIN_CELLS]
         if not asked:
             break
         asked = _asked_once(asked, resolution_m)
-    arcs = [arc for p in pieces for arc in p.arcs]
-    return sorted(arcs, key=lambda arc: -arc.radius_m * arc.span_rad)[:MAX_ARCS]
+    now = {key: known.get(key, tuple(p.arcs)) for key, p in pieces.items()}
+    known.clear()
+    known.update(now)
+    return sorted((arc for arcs in now.values() for arc in arcs), key=lambda arc: -arc.radius_m * arc.span_rad)[:MAX_ARCS]
 
 
 def _largest(points_m: NDArray[np.float64], piece: NDArray[np.int64]) -> list[_Piece]:

@@ -16,8 +16,9 @@ from agent.features.corners import Corners, corners_of
 from agent.features.directions import direction_spectrum
 from agent.features.extraction import feature_map
 from agent.features.field import UNKNOWN_BYTE, MatchField
-from agent.features.incremental import updated_walls
+from agent.features.incremental import Change, updated_field, updated_walls
 from agent.features.lines import WallLines, wall_lines
+from agent.features.round_walls import ArcsOfPieces
 from agent.features.signatures import MAX_DENSE_TARGETS, MAX_TARGETS, Signatures, signatures_of
 from agent.features.structure import structure_kinds
 from agent.features.wall_points import WallPoints, wall_points
@@ -34,6 +35,7 @@ class MapSnapshot:
     def __init__(self, grid: OccupancyGrid) -> None:
         self.grid = grid
         self._kept: dict[Hashable, Any] = {}
+        self._arcs: ArcsOfPieces = {}
 
     @staticmethod
     def of(grid: OccupancyGrid) -> MapSnapshot:
@@ -42,8 +44,12 @@ class MapSnapshot:
     def updated(self, grid: OccupancyGrid) -> MapSnapshot:
         """The snapshot of a later state of the same map: what did not change is not fitted again."""
         later = MapSnapshot(grid)
+        later._arcs = dict(self._arcs)
         if "walls" in self.__dict__:
-            later.__dict__["walls"] = updated_walls(self.grid, self.working, self.walls, grid, later.working)
+            change = Change.between(self.grid, self.working, grid, later.working)
+            walls = later.__dict__["walls"] = updated_walls(change, self.working, self.walls, later.working)
+            if "field" in self.__dict__:
+                later.__dict__["field"] = updated_field(change, self.field, self.walls, later.working, walls)
         return later
 
     def kept(self, key: Hashable, make: Callable[[MapSnapshot], T]) -> T:
@@ -113,7 +119,7 @@ class MapSnapshot:
     @cached_property
     def features(self) -> FeatureMap:
         """What travels and what a person can read."""
-        return feature_map(self.working, self.walls, self.lines, self.grid.origin)
+        return feature_map(self.working, self.walls, self.lines, self.grid.origin, self._arcs)
 
     def _signatures(self, limit: int) -> Signatures:
         known = (self.field.fine != UNKNOWN_BYTE) | self.working.free.view(np.bool_)

@@ -7,6 +7,7 @@ import time
 import numpy as np
 import pytest
 
+from agent.features.field import MatchField
 from agent.features.snapshot import MapSnapshot
 from protocol.geometry import SE2
 from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
@@ -40,17 +41,36 @@ def test_an_updated_snapshot_equals_a_fresh_one(seed: int) -> None:
     assert same_walls(before.updated(changed), MapSnapshot.of(changed))
 
 
-def test_everything_that_follows_from_an_update_is_as_if_made_afresh() -> None:
-    before = MapSnapshot.of(GRID)
-    assert len(before.walls) and len(before.features)
-    changed = with_a_box(GRID, 40, 60)
-    later, fresh = before.updated(changed), MapSnapshot.of(changed)
-    for image in ("fine", "coarse", "nearest", "distance_m"):
-        assert np.array_equal(getattr(later.field, image), getattr(fresh.field, image)), image
-    for table in ("lines", "circles", "arcs", "curves"):
-        assert np.array_equal(getattr(later.features, table), getattr(fresh.features, table)), table
-    assert np.array_equal(later.signatures.values, fresh.signatures.values)
-    assert np.array_equal(later.corners.positions_m, fresh.corners.positions_m)
+def everything(snapshot: MapSnapshot) -> dict[str, np.ndarray]:
+    """All that matching keeps of a map, by name."""
+    kept = {name: getattr(snapshot.field, name) for name in ("fine", "coarse", "nearest", "distance_m")}
+    kept |= {name: getattr(snapshot.features, name) for name in ("lines", "circles", "arcs", "curves")}
+    share = np.array(snapshot.field.wall_share)
+    return kept | {"share": share, "signatures": snapshot.signatures.values, "corners": snapshot.corners.positions_m}
+
+
+def test_everything_that_follows_from_updates_is_as_if_made_afresh() -> None:
+    later = MapSnapshot.of(GRID)
+    everything(later)
+    changed = GRID
+    for row, col in ((0, 0), (40, 60), (41, 63), (GRID.height - 8, 30), (70, GRID.width - 8)):
+        changed = with_a_box(changed, row, col)
+        later, fresh = later.updated(changed), everything(MapSnapshot.of(changed))
+        for name, value in everything(later).items():
+            assert np.array_equal(value, fresh[name]), (name, row, col)
+
+
+def test_a_field_is_made_again_only_near_a_change(monkeypatch: pytest.MonkeyPatch) -> None:
+    wide = OccupancyGrid(np.tile(GRID.cells, (3, 3)), GRID.resolution_m)
+    before = MapSnapshot.of(wide)
+    everything(before)
+    made: list[int] = []
+    real = MatchField.of
+    monkeypatch.setattr(MatchField, "of", lambda grid, walls: made.append(grid.free.size) or real(grid, walls))
+    assert before.updated(with_a_box(wide, 100, 200)).field.fine.shape == before.field.fine.shape
+    assert len(made) == 1
+    assert made[0] < 0.1 * wide.cells.size
+    assert before.updated(wide).field is before.field
 
 
 def test_a_map_whose_origin_moved_keeps_its_wall_points() -> None:
