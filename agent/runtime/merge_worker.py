@@ -55,7 +55,7 @@ class MergeWorker:
         self._options, self._pace = options, pace
         self._jobs: queue.PriorityQueue[tuple[int, int, Match | Fuse, OnDone]] = queue.PriorityQueue(maxsize=MAX_JOBS)
         self._order = itertools.count()
-        self._snapshots: OrderedDict[bytes, MapSnapshot] = OrderedDict()
+        self._snapshots: OrderedDict[bytes, tuple[str, MapSnapshot]] = OrderedDict()
         self.cpu_s = 0.0
         self.finished = 0
         self.dropped = 0
@@ -87,18 +87,25 @@ class MergeWorker:
             on_done(done)
 
     def _match(self, job: Match) -> MergeResult:
-        ours = self._snapshot(job.ours_digest, job.ours)
-        theirs = self._snapshot(job.theirs_digest, job.theirs)
+        ours = self._snapshot("", job.ours_digest, job.ours)
+        theirs = self._snapshot(job.peer, job.theirs_digest, job.theirs)
         if job.kind is MatchKind.VERIFY and job.T_ours_theirs is not None:
             return verify_match(ours, theirs, job.T_ours_theirs, self._options)
         return match_maps(ours, theirs, self._options)
 
-    def _snapshot(self, digest: bytes, grid: OccupancyGrid) -> MapSnapshot:
+    def _snapshot(self, peer: str, digest: bytes, grid: OccupancyGrid) -> MapSnapshot:
+        """Of a peer's map, or of ours ("")."""
         key = digest + str(grid.resolution_m).encode()  # coarse and fine maps of one version share the digest
-        snapshot = self._snapshots.get(key)
-        if snapshot is None:
-            snapshot = self._snapshots[key] = MapSnapshot.of(grid)
+        if key not in self._snapshots:
+            self._snapshots[key] = peer, self._made(peer, grid)
             while len(self._snapshots) > MAX_SNAPSHOTS:
                 self._snapshots.popitem(last=False)
         self._snapshots.move_to_end(key)
-        return snapshot
+        return self._snapshots[key][1]
+
+    def _made(self, peer: str, grid: OccupancyGrid) -> MapSnapshot:
+        """From what an earlier state of the same map left, where one is kept."""
+        for whose, earlier in reversed(self._snapshots.values()):
+            if whose == peer and earlier.grid.resolution_m == grid.resolution_m:
+                return earlier.updated(grid)
+        return MapSnapshot.of(grid)

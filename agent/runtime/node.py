@@ -77,6 +77,7 @@ class Node:
         self.boot_id = secrets.randbits(63) if boot_id is None else boot_id
         self._pace = pace
         self._unread: MapEstimate | None = None  # the newest map whose features were not made yet
+        self._snapshot: MapSnapshot | None = None  # the newest of which they were
         self._next_features_s = 0.0
         self.started_s = time.monotonic()
         self.state = StateDirectory(state_folder) if state_folder is not None else None
@@ -148,7 +149,8 @@ class Node:
         if self._unread is not None and self._pace.clock() >= self._next_features_s:
             estimate, self._unread = self._unread, None
             self._next_features_s = self._pace.clock() + self._features_period_s
-            self.fleet.local_maps.put((estimate, MapSnapshot.of(estimate.grid).features))
+            self._snapshot = self._snapshot.updated(estimate.grid) if self._snapshot else MapSnapshot.of(estimate.grid)
+            self.fleet.local_maps.put((estimate, self._snapshot.features))
 
     def __enter__(self) -> Node:
         try:
