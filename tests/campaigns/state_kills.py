@@ -29,6 +29,7 @@ from pathlib import Path
 from agent.commands.children import AgentProcess, ChildError
 from agent.runtime.state import CorruptState, StateDirectory, pack, unpack
 from tests.bench.tables import markdown
+from tests.harness.processes import percentile
 
 NAME = "mapper"
 MAX_BYTES = 64 * 1024
@@ -57,7 +58,8 @@ class Tally:
         figures = asdict(self) | {"seconds": round(self.seconds, 1)}
         figures.pop("ready_s")
         if len(ready) > 1:
-            figures |= {"READY p50 s": round(statistics.median(ready), 2), "READY p99 s": round(ready[int(0.99 * len(ready))], 2)}
+            figures |= {"READY p50 s": round(statistics.median(ready), 2), "READY p99 s": round(percentile(ready, 0.99), 2)}
+            figures |= {"READY worst s": round(ready[-1], 2), "load": round(os.getloadavg()[1], 1)}
         return figures
 
     @property
