@@ -207,21 +207,33 @@ def chart(rows: list[Row]) -> str:
     return log_log_chart("What a fleet costs each robot", "robots", "a robot and minute, steady state", series)
 
 
+def known_rows(file: Path | None) -> dict[int, Row]:
+    """Rows of earlier runs, by size."""
+    if file is None or not file.exists():
+        return {}
+    return {row["robots"]: Row(**row) for row in json.loads(file.read_text())}
+
+
+def write(file: Path, text: str) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(text)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sizes", type=int, nargs="+", default=[2, 10, 30, 100, 300, 1000])
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--json", type=Path, help="rows of earlier runs in it are kept: sizes may be run one by one")
     parser.add_argument("--svg", type=Path, default=_PICTURE)
     args = parser.parse_args()
-    rows = []
+    rows = known_rows(args.json)
     for size in args.sizes:
-        rows.append(measure(size))
-        print(json.dumps(asdict(rows[-1])), file=sys.stderr, flush=True)
-    print(markdown([shown(row) for row in rows]))
-    for file, text in ((args.json, json.dumps([asdict(row) for row in rows], indent=1) + "\n"), (args.svg, chart(rows))):
-        if file is not None:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_text(text)
+        rows[size] = measure(size)
+        ordered = [row for _, row in sorted(rows.items())]
+        if args.json is not None:
+            write(args.json, json.dumps([asdict(row) for row in ordered], indent=1) + "\n")
+        write(args.svg, chart(ordered))
+        print(f"{size} robots: {rows[size].cpu_s:.0f} CPU s", file=sys.stderr, flush=True)
+    print(markdown([shown(row) for _, row in sorted(rows.items())]))
     return 0
 
 
