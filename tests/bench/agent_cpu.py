@@ -19,23 +19,13 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from tests.bench.tables import print_row
+from tests.harness.processes import cpu_s, peak_mb, resident_mb
+
 MAPQUILT = [str(Path(sys.executable).with_name("mapquilt"))]
 WARM_UP_S = 10.0
 START_WITHIN_S = 60.0
-TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
 BAR_CPU = 0.25
-
-
-def cpu_s(pid: int) -> float:
-    """User and system time of a process so far."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) * TICK_S
-
-
-def resident_mb(pid: int, key: str) -> float:
-    """VmRSS (now) or VmHWM (at most)."""
-    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith(key)) / 1024
 
 
 def status(robot: str) -> dict[str, object]:
@@ -88,8 +78,8 @@ def watched(robot: str, pid: int, lidar: str, world: str, seconds: float) -> dic
         "bar": BAR_CPU,
         "mapping ms a scan": after["cpu_ms_per_scan"],
         "scans lost": int(str(after["scans_lost"])) - int(str(before["scans_lost"])),
-        "RSS MB": round(resident_mb(pid, "VmRSS"), 1),
-        "peak MB": round(resident_mb(pid, "VmHWM"), 1),
+        "RSS MB": round(resident_mb(pid), 1),
+        "peak MB": round(peak_mb(pid), 1),
         "known m2": after.get("known_m2"),
         "load": round(os.getloadavg()[0], 1),
     }
@@ -112,11 +102,7 @@ def main() -> None:
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         row = measure(arguments.lidar, arguments.world, arguments.seconds, Path(folder))
-    if arguments.json:
-        print(json.dumps(row))
-        return
-    print("| " + " | ".join(row) + " |\n|" + " --- |" * len(row))
-    print("| " + " | ".join(map(str, row.values())) + " |")
+    print_row(row, as_json=arguments.json)
 
 
 if __name__ == "__main__":

@@ -31,6 +31,7 @@ from hw.readings import LaserScan, Odometry
 from protocol.geometry import SE2
 from tests.bench import recordings
 from tests.bench.recordings import Recording
+from tests.bench.tables import heading, line
 
 LOGS = "intel,freiburg-079,freiburg-campus,acapulco"
 GMAPPING_MS = {"intel": 87.0, "freiburg-079": 151.0}  # MAPPING.md 3a: GMapping C++, 30 particles, same logs
@@ -210,10 +211,6 @@ def rows_of(name: str, seeds: list[int], particles: int, faults: bool) -> Iterat
     yield {"log": name, "seed": "reference", **scores(recording, reference(recording))}
 
 
-def print_row(row: dict[str, object], columns: list[str]) -> None:
-    print("| " + " | ".join("" if row.get(c) is None else str(row[c]) for c in columns) + " |", flush=True)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--logs", default=LOGS)
@@ -235,9 +232,9 @@ def main() -> None:
             every.append(row)
             if not columns and not arguments.json:
                 columns = list(row)
-                print("| " + " | ".join(columns) + " |\n|" + " --- |" * len(columns))
+                print(heading(columns))
             if not arguments.json:
-                print_row(row, columns)
+                print(line(row, columns), flush=True)
     if arguments.json:
         print(json.dumps(every))
 

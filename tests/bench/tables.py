@@ -1,22 +1,35 @@
-"""Rows of figures as the Markdown table that goes into a page."""
+"""Rows of figures as the Markdown table that goes into a page, or as JSON."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 
 
 def markdown(rows: Sequence[Mapping[str, object]]) -> str:
     """One line a row, the columns of the first; a row may leave some out."""
     columns = list(rows[0]) if rows else []
-    lines = [columns, ["---"] * len(columns), *([_cell(row.get(name, "")) for name in columns] for row in rows)]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return "\n".join([heading(columns), *(line(row, columns) for row in rows)])
 
 
-def next_line(row: Mapping[str, object], is_first: bool) -> str:
-    """One more line of a table that is printed while it grows; the first brings the heading."""
-    lines = markdown([row]).splitlines()
-    return "\n".join(lines if is_first else lines[2:])
+def heading(columns: Sequence[str]) -> str:
+    """The names of the columns, and the rule below them."""
+    return f"{_joined(columns)}\n{_joined(['---'] * len(columns))}"
+
+
+def line(row: Mapping[str, object], columns: Sequence[str]) -> str:
+    """One row, for those who tell theirs as they are measured."""
+    return _joined([_cell(row.get(name)) for name in columns])
+
+
+def print_row(figures: Mapping[str, object], *, as_json: bool) -> None:
+    """One row of Markdown, or one line of JSON."""
+    print(json.dumps(figures) if as_json else markdown([figures]))
+
+
+def _joined(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
 
 
 def _cell(value: object) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    return "" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)

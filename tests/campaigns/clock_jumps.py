@@ -24,8 +24,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+from tests.bench.tables import print_row
 from tests.harness.fleet import Fleet
-from tests.harness.processes import print_row
 
 LIBRARY = r"""
 #define _GNU_SOURCE

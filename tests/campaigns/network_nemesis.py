@@ -35,10 +35,11 @@ from typing import Any
 from agent.commands.children import AgentProcess
 from agent.commands.demo_stage import Actor, Stage
 from agent.runtime.control import ControlError
+from tests.bench.tables import print_row
 from tests.harness.fleet import Fleet
 from tests.harness.kept import Record, keep, kept
 from tests.harness.network import Cable, Mode, Network
-from tests.harness.processes import percentile, print_row
+from tests.harness.processes import percentile
 
 CONVERGE_WITHIN_S = 60.0
 BAR_S = 5.0

@@ -33,8 +33,9 @@ from protocol.channels import PUSHED_REGISTERS, push_register, robot_key
 from protocol.codec import encode
 from protocol.features import FeatureMap
 from protocol.messages import NO_DIGEST, Beat, MapAnnouncement, MapVersion, Message
+from tests.bench.tables import print_row
 from tests.harness.fleet import Fleet
-from tests.harness.processes import print_row, resident_mb
+from tests.harness.processes import resident_mb
 
 MAX_LOST_SHARE, MAX_GAP_S, MAX_GROWTH_MB = 0.01, 2.0, 64.0
 INVENTED = 200

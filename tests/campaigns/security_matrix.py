@@ -32,7 +32,7 @@ from agent.runtime.guard import SharedGuard, guard_for
 from agent.runtime.network import NetworkSettings, zenoh_config
 from protocol.channels import PUSHED_REGISTERS, robot_key, subscriptions
 from protocol.errors import RemoteProtocolError
-from tests.harness.processes import print_row
+from tests.bench.tables import print_row
 
 FLEET = "secure"
 REGISTERS = tuple(register.replace("*", "a") for register in PUSHED_REGISTERS)

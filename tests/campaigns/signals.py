@@ -24,8 +24,9 @@ from pathlib import Path
 from typing import Any
 
 from agent.commands.children import AgentProcess
+from tests.bench.tables import print_row
 from tests.campaigns.state_kills import NAME, torn
-from tests.harness.processes import percentile, print_row
+from tests.harness.processes import percentile
 
 SHORTEST_S, LONGEST_S = 0.05, 6.0
 LEAVE_WITHIN_S = 14.0  # the robot's own watchdog ends it after 12 s

@@ -25,9 +25,10 @@ from hw.sim.catalogue import BASES, LIDARS
 from hw.sim.robot import SimulatedRobot
 from hw.sim.sight import Sight
 from hw.sim.world import open_world
+from tests.bench.tables import print_row
 from tests.harness.fleet import Fleet
 from tests.harness.golden import FIRST_S, READ_S, TURN_S, Run, rehearsal
-from tests.harness.processes import open_files, print_row, resident_mb, threads
+from tests.harness.processes import open_files, resident_mb, threads
 from tests.harness.rehearsal import Rehearsal, Wire
 
 MAX_SLOPE_MB_PER_H = 1.0

@@ -12,8 +12,9 @@ import sys
 import time
 from typing import Any
 
+from tests.bench.tables import print_row
 from tests.harness.fleet import Fleet
-from tests.harness.processes import own_share_mb, print_row, resident_mb
+from tests.harness.processes import own_share_mb, resident_mb
 
 MAX_RSS_MB = 120.0
 

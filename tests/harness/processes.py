@@ -1,18 +1,21 @@
-"""What the kernel says of a process, and one row of figures about it: for campaigns that watch robots from outside."""
+"""What the kernel says of a process: for campaigns that watch robots from outside."""
 
 from __future__ import annotations
 
-import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 
 def resident_mb(pid: int) -> float:
     """Memory that is in RAM now; 0 when the process is gone."""
     return _status(pid, "VmRSS:") / 1024
+
+
+def peak_mb(pid: int) -> float:
+    """The most memory that was ever in RAM."""
+    return _status(pid, "VmHWM:") / 1024
 
 
 def own_share_mb(pid: int) -> float:
@@ -57,12 +60,3 @@ def percentile(values: Sequence[float], share: float) -> float:
     """The value that this share of all values does not exceed; NaN of nothing."""
     ordered = sorted(values)
     return ordered[max(0, math.ceil(share * len(ordered)) - 1)] if ordered else math.nan
-
-
-def print_row(figures: Mapping[str, Any], *, as_json: bool) -> None:
-    """One row of Markdown, or one line of JSON."""
-    if as_json:
-        print(json.dumps(figures))
-        return
-    print("| " + " | ".join(figures) + " |\n|" + " --- |" * len(figures))
-    print("| " + " | ".join(f"{v:.2f}" if isinstance(v, float) else str(v) for v in figures.values()) + " |")
