@@ -138,7 +138,9 @@ class Mapper:
 
     def _look_everywhere(self, points: ScanPoints) -> ScanOutcome:
         """Lost: back where the wheels say, or a few headings of the search per scan; found, or after a while a new map."""
-        if self.map.track(self._motion(points), points).fraction >= GOOD_FRACTION:
+        motion = self._motion(points)
+        tracked = self.map.track(motion, points)
+        if tracked.fraction >= GOOD_FRACTION:
             return self._found(points)
         if self.search is None:
             self.search = self.map.search_for(points.surfels, points.stamp_s)
@@ -149,6 +151,8 @@ class Mapper:
                 self.map.move_to(found, self.search.stamp_s)
                 return self._found(points)
             self.search = None
+            if motion.is_known and not tracked.is_jump and self._contradiction(points, tracked) <= CONTRADICTED:
+                return self._found(points)  # nowhere else, and nothing speaks against the wheels: it drove on into the unknown
             if points.stamp_s - self.lost_since_s > NEW_MAP_AFTER_S:
                 return self._begin_anew(points)
         reason = "lost: looking for this place on the whole map; nothing is drawn" if self.odometry.stamps_s else NO_WHEELS

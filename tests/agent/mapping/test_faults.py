@@ -17,6 +17,7 @@ from protocol.grid import FREE, OCCUPIED, UNKNOWN
 from tests.agent.mapping.worlds import CORRIDOR, ROOMS, DriftingOdometry, rounds, scan_at
 
 OPTIONS = MappingOptions(particles=8)
+CROWD = np.array([[-1, -0.5, 0.9, -0.5], [0.9, -0.5, 0.9, 0.6], [0.9, 0.6, -0.9, 0.6], [-0.9, 0.6, -1, -0.5]])  # around the robot
 
 
 @dataclass
@@ -209,12 +210,11 @@ def test_a_kidnapped_robot_finds_itself_again_on_its_own_map(drive: Drive) -> No
 
 def test_a_crowd_around_the_robot_ends_in_the_same_map_at_the_same_place(drive: Drive) -> None:
     drive.steps(150)
-    crowd = np.array([[-1, -0.5, 0.9, -0.5], [0.9, -0.5, 0.9, 0.6], [0.9, 0.6, -0.9, 0.6], [-0.9, 0.6, -1, -0.5]])
     x, y = drive.path[drive.at][1].x_m, drive.path[drive.at][1].y_m
     outcomes = []
     for k in range(20):  # the robot waits
         stamp_s = drive.path[drive.at][0] + 0.2 * k
-        around = crowd + np.array([x, y, x, y]) + drive.rng.normal(0.0, 0.1, crowd.shape)
+        around = CROWD + np.array([x, y, x, y]) + drive.rng.normal(0.0, 0.1, CROWD.shape)
         drive.mapper.add_odometry(replace(drive.wheels.sample(stamp_s, drive.path[drive.at][1]), stamp_s=stamp_s))
         outcomes.append(drive.mapper.add_scan(scan_at(around, drive.path[drive.at][1], stamp_s, drive.rng)))
     assert outcomes[10].status is MapperStatus.LOST
@@ -242,6 +242,25 @@ def test_a_robot_carried_to_an_unknown_place_begins_a_new_map(drive: Drive) -> N
     assert after.epoch == before.epoch + 1
     assert outcomes[-1].status is MapperStatus.TRACKING
     assert after.grid.known_area_m2() < 20.0
+
+
+def test_a_robot_lost_in_a_crowd_that_drives_on_into_the_unknown_keeps_its_map(drive: Drive) -> None:
+    """When the LIDAR sees again nothing of it is on the map yet; only the wheels know where it is."""
+    drive.mapper = Mapper(replace(OPTIONS, matching_range_m=3.0), seed=0)
+    drive.steps(20)
+    (_, here), outcomes = drive.path[drive.at], []
+    for k in range(90):
+        is_crowd, is_blind = k < 8, 8 <= k < 60
+        pose = here if is_crowd else drive.path[drive.at + k - 8][1]
+        walls = CROWD + np.tile([pose.x_m, pose.y_m], 2) + drive.rng.normal(0.0, 0.1, CROWD.shape) if is_crowd else ROOMS
+        stamp_s = drive.now_s + 0.2 * k
+        drive.mapper.add_odometry(drive.wheels.sample(stamp_s, pose))
+        outcomes.append(drive.mapper.add_scan(scan_at(walls, pose, stamp_s, drive.rng, max_m=0.1 if is_blind else 3.0)))
+    assert {outcome.status for outcome in outcomes[4:8]} == {MapperStatus.LOST}
+    assert outcomes[-1].status is not MapperStatus.LOST
+    assert any(outcome.is_keyframe for outcome in outcomes[-10:])
+    assert drive.mapper.epoch == 0
+    assert outcomes[-1].T_map_robot.distance_m(drive.path[0][1].inverse() @ pose) < 0.5
 
 
 def test_in_a_bare_corridor_the_result_says_so_and_odometry_holds_the_way() -> None:
