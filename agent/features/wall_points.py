@@ -60,6 +60,8 @@ class WallPoints:
 
 def surface_cells(grid: WorkingGrid) -> NDArray[np.int32]:
     """(N, 2) (row, col) of the occupied cells that touch free space."""
+    if not grid.free.any():
+        return np.zeros((0, 2), np.int32)
     reached = cv2.dilate(grid.free, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
     found = cv2.findNonZero(reached & grid.occupied)
     if found is None:

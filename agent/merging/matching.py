@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +22,7 @@ from protocol.geometry import SE2
 
 _ALTERNATIVES = 8
 _POINTS = 500
+_NOWHERE_M = 1e7  # no two maps are this far apart; single precision could not tell where
 
 
 def match_maps(ours: MapSnapshot, theirs: MapSnapshot, options: MatchOptions | None = None) -> MergeResult:
@@ -44,6 +46,8 @@ def verify_match(ours: MapSnapshot, theirs: MapSnapshot, T_ours_theirs: SE2, opt
     if not len(ours.thin_walls) or not len(theirs.thin_walls):
         return MergeResult.none(Reason.EMPTY)
     T = ours.grid.origin.inverse() @ T_ours_theirs @ theirs.grid.origin
+    if not (T.is_finite() and math.hypot(T.x_m, T.y_m) < _NOWHERE_M):
+        return MergeResult.none(Reason.NO_CANDIDATES)
     pose = np.array([[T.x_m, T.y_m, T.theta_rad]])
     return judged(
         ours,

@@ -7,6 +7,8 @@ import time
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from agent.features.snapshot import MapSnapshot
 from agent.merging.localization import localize
@@ -14,6 +16,7 @@ from agent.merging.matching import match_maps, verify_match
 from agent.merging.result import MatchStatus, MergeResult
 from protocol.geometry import SE2
 from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from tests.agent.features.test_paper import any_cells
 from tests.harness.floorplans import office
 
 PLAN = office(seed=11)
@@ -56,6 +59,25 @@ def test_odd_maps_are_answered_in_bounded_time_and_merge_with_no_other(name: str
         assert time.process_time() - started < 5.0
         assert ours is theirs or not result.accepted
         assert np.isfinite(result.covariance).all()
+
+
+@settings(max_examples=40, deadline=None)
+@given(any_cells, any_cells, st.sampled_from([0.03, 0.1, 0.2, 2.0]))
+def test_no_cells_whatever_upset_matching_localizing_or_updating(ours: np.ndarray, theirs: np.ndarray, cell_m: float) -> None:
+    a, b = snapshot(ours), snapshot(theirs, cell_m)
+    for result in (match_maps(a, b), localize(a, b), match_maps(b.updated(a.grid), a)):
+        assert np.isfinite(result.covariance).all()
+        assert result.T_ours_theirs is None or result.T_ours_theirs.is_finite()
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    "T", [SE2(math.nan, 0, 0), SE2(0, math.inf, 0), SE2(1e300, 0, 0), SE2(0, 0, math.nan), SE2(1e6, -1e6, 1e9), SE2(0, 0, 1e300)]
+)
+def test_a_transform_that_is_none_is_not_confirmed(T: SE2) -> None:
+    result = verify_match(office_map(), office_map(), T)
+    assert result.status is MatchStatus.NO
+    assert np.isfinite(result.covariance).all()
 
 
 def test_the_mirror_image_of_a_building_without_symmetry_never_merges() -> None:
