@@ -79,8 +79,9 @@ def build_driver(url: DeviceUrl, kind: str) -> Driver:
     drivers: Mapping[str, Callable[[DeviceUrl], Driver]] = LIDARS if kind == "lidar" else BASES
     if url.scheme not in drivers:
         known = ", ".join(sorted({*drivers, *_factories, *_on_demand}))
-        other = "open it as the other kind of device" if url.scheme in (*LIDARS, *BASES) else f"there are {known}"
-        raise DeviceConfigError(f"{url.text}: '{url.scheme}' is no kind of {kind}; {other}")
+        right = {**dict.fromkeys(LIDARS, "a LIDAR: --lidar"), **dict.fromkeys(BASES, "a wheel base: --wheels")}.get(url.scheme)
+        hint = f"it is {right} {url.text}" if right else f"there are {known}"
+        raise DeviceConfigError(f"{url.text}: '{url.scheme}' is no kind of {kind}; {hint}")
     driver = drivers[url.scheme](url)
     if "baud" in url.options:
         driver.bauds = (url.integer("baud", 0, 300, 4_000_000),)

@@ -18,7 +18,10 @@ from hw.port import port_list, user_of
 
 SERIAL_LINKS = Path("/dev/serial")
 # silent listeners first: asking an unknown device may start something, and a streaming one tells within half a second
-PROBE_URLS = ("wheels", "ld06", "rplidar", "ydlidar", "hokuyo", "xv11", "kobuki", "create2", "arduino", "sick", "roboclaw")
+PROBE_URLS = (
+    *("wheels", "ld06", "rplidar", "ydlidar", "hokuyo", "xv11", "kobuki"),
+    *("create2", "arduino", "sick", "roboclaw", "stl27l", "lds01"),
+)
 ANY_GEOMETRY = {"arduino": "?ticks=1000&radius=0.05&track=0.3", "roboclaw": "?ticks=1000&radius=0.05&track=0.3"}  # they know none
 WHEEL_SCHEMES = ("wheels", "kobuki", "create2", "arduino", "roboclaw")
 
@@ -41,6 +44,12 @@ class Answer:
     url: str
     kind: str  # "lidar" or "wheels"
     health: DeviceHealth
+
+    @property
+    def usage(self) -> str:
+        """The URL to use, with what the device cannot tell of itself left to fill in."""
+        scheme = self.url.partition(":")[0]
+        return f"'{self.url}?ticks=...&radius=...&track=...'" if scheme in ANY_GEOMETRY else self.url
 
 
 def serial_ports() -> list[SerialPortInfo]:

@@ -1,6 +1,7 @@
 """One life of an open port: its rate is found, the device woken and its bytes fed to the driver, until the port is lost.
 
-A stall (no reading for three periods, at least 0.3 s) restarts the stream; a second in a row ends the session.
+A stall (no reading for three periods, at least 0.3 s) restarts the stream; a second in a row ends the session.  A recording
+has no rate, and a pause in it is none to mend: what was done about it then comes next.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ class Session:
 
     def _bring_up(self, rate: KnownRate) -> None:
         """Try each rate until the device answers its start script and sends a first good frame."""
-        bauds = rate.to_try(self._driver.bauds)
+        bauds = [self._driver.bauds[0]] if self._is_passive else rate.to_try(self._driver.bauds)
         problems: list[DeviceError] = []
         for baud in bauds:
             if self._stopping.is_set():
@@ -115,7 +116,7 @@ class Session:
             if n:
                 has_run, restarts = True, 0
                 self._judge(judge, now_s)
-            elif self._is_stalled(now_s, has_run):
+            elif not self._is_passive and self._is_stalled(now_s, has_run):
                 self._restart_stalled(restarts)
                 restarts += 1
                 self._board.forgive(time.monotonic())

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict
 
-from agent.exits import NEGATIVE, OK
+from agent.exits import NEGATIVE, OK, USAGE, CommandError
+from hw.device import schemes
 from hw.probing import PROBE_URLS, Answer, SerialPortInfo, probe, serial_ports
 
 EXAMPLES = """\
@@ -30,8 +33,9 @@ def run(args: argparse.Namespace) -> int:
     if not ports:
         print("no serial port; is the adapter plugged in? (`dmesg | tail` tells what the kernel saw)", file=sys.stderr)
         return NEGATIVE
-    schemes = tuple(args.schemes.split(",")) if args.schemes else PROBE_URLS
-    found = [(port, _ask(port, schemes) if args.probe else None) for port in ports]
+    wanted = tuple(args.schemes.split(",")) if args.schemes else PROBE_URLS
+    _check(wanted, [port.device for port in ports])
+    found = [(port, _ask(port, wanted) if args.probe else None) for port in ports]
     if args.json:
         print(json.dumps([_as_json(port, answer) for port, answer in found], indent=2))
     else:
@@ -39,9 +43,20 @@ def run(args: argparse.Namespace) -> int:
     return OK if not args.probe or any(answer for _, answer in found) else NEGATIVE
 
 
-def _ask(port: SerialPortInfo, schemes: tuple[str, ...]) -> Answer | None:
+def _check(wanted: Sequence[str], ports: Sequence[str]) -> None:
+    """Probing takes long: what cannot be found is said before."""
+    known = [*schemes("lidar"), *schemes("wheels")]
+    for scheme in wanted:
+        if scheme not in known:
+            raise CommandError(f"--as {scheme}: no such kind; there are {', '.join(known)}", USAGE)
+    for port in ports:
+        if "://" not in port and not os.path.exists(port):
+            raise CommandError(f"{port}: no such port; `mapquilt devices` lists the ports there are", NEGATIVE)
+
+
+def _ask(port: SerialPortInfo, wanted: tuple[str, ...]) -> Answer | None:
     print(f"{port.device}: listening ...", file=sys.stderr)
-    return probe(port.device, schemes)
+    return probe(port.device, wanted)
 
 
 def _as_json(port: SerialPortInfo, answer: Answer | None) -> dict[str, object]:
@@ -60,7 +75,7 @@ def _as_text(port: SerialPortInfo, answer: Answer | None, was_probed: bool) -> s
     if answer is not None:
         health = answer.health
         name = " ".join(word for word in (health.model, health.serial and f"serial {health.serial}") if word)
-        lines.append(f"    {name}, {health.baud} baud: use  --{answer.kind} {answer.url}")
+        lines.append(f"    {name}, {health.baud} baud: use  --{answer.kind} {answer.usage}")
     elif was_probed:
         lines.append("    nobody we know answers; is the device powered, and the port not in use?")
     return "\n".join(lines)

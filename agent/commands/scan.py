@@ -1,4 +1,4 @@
-"""`mapquilt scan DEVICE`: live figures of a LIDAR, and a picture of what it sees."""
+"""`mapquilt scan DEVICE`: live figures of a LIDAR, and a picture of what it sees; of a wheel base, where it says it is."""
 
 from __future__ import annotations
 
@@ -12,17 +12,21 @@ import numpy as np
 
 from agent.commands.files import written_file
 from agent.commands.scan_picture import scan_picture
+from agent.commands.scan_wheels import WheelTeller
 from agent.exits import NEGATIVE, OK, USAGE, CommandError
 from agent.view.render import png
-from hw.device import Source, open_lidar
+from hw.device import Source, open_lidar, open_wheels, schemes
+from hw.driver import Reading
 from hw.errors import DeviceConfigError
 from hw.health import DeviceHealth
-from hw.readings import LaserScan
+from hw.readings import LaserScan, Odometry
+from hw.urls import parse_url
 
 EXAMPLES = """\
   mapquilt scan ld06:/dev/ttyUSB0                    a line a second, until Ctrl-C
   mapquilt scan rplidar:/dev/ttyUSB0 -n 20 --json    twenty scans, as JSON lines
   mapquilt scan sim:office -n 1 --png scan.png       what it sees, as a picture
+  mapquilt scan wheels:/dev/ttyACM0                  push the robot a metre: do its wheels say so?
 """
 
 BARS = " ▁▂▃▄▅▆▇█"
@@ -30,7 +34,7 @@ BINS = 24  # of the range histogram
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("device", metavar="DEVICE", help="for example ld06:/dev/ttyUSB0")
+    parser.add_argument("device", metavar="DEVICE", help="for example ld06:/dev/ttyUSB0, or a wheel base")
     parser.add_argument("-n", "--count", type=int, default=0, help="stop after so many scans (0: Ctrl-C)")
     parser.add_argument("--seconds", type=float, default=0.0, help="stop after so long (0: Ctrl-C)")
     parser.add_argument("--png", type=Path, metavar="FILE", help="write the last scan as a picture")
@@ -39,34 +43,41 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     try:
-        device = open_lidar(args.device)
+        is_wheels = parse_url(args.device).scheme in schemes("wheels")
+        device = (open_wheels if is_wheels else open_lidar)(args.device)
     except DeviceConfigError as error:
         raise CommandError(str(error), USAGE) from error
+    if is_wheels and args.png:
+        raise CommandError(f"--png: {args.device} sees nothing; it is a wheel base", USAGE)
     device.start()
     try:
         last, count = _watch(device, args)
     finally:
         device.stop()
     if last is None:
-        raise CommandError(device.health().last_error or f"{args.device}: no scan came", NEGATIVE)
-    if args.png:
+        raise CommandError(device.health().last_error or f"{args.device}: no reading came", NEGATIVE)
+    if args.png and isinstance(last, LaserScan):
         written_file(args.png, png(scan_picture(last)))
         print(f"{args.png}: {len(last.ranges_m)} beams", file=sys.stderr)
-    print(f"{count} scans", file=sys.stderr)
+    print(f"{count} {'readings' if is_wheels else 'scans'}", file=sys.stderr)
     return OK
 
 
-def _watch(device: Source, args: argparse.Namespace) -> tuple[LaserScan | None, int]:
-    """Read and tell, until enough; the last scan and how many there were."""
-    last: LaserScan | None = None
+def _watch(device: Source, args: argparse.Namespace) -> tuple[Reading | None, int]:
+    """Read and tell, until enough; the last reading and how many there were."""
+    last: Reading | None = None
     count, told_s, told_error = 0, 0.0, ""
+    wheels = WheelTeller(args.json)
     end_s = time.monotonic() + (args.seconds or float("inf"))
     try:
         while time.monotonic() < end_s and (count < args.count or not args.count):
             reading = device.read(0.5)
             health = device.health()
-            if isinstance(reading, LaserScan):
+            if reading is not None:
                 last, count = reading, count + 1
+            if isinstance(reading, Odometry):
+                wheels.tell(reading, device)
+            elif reading is not None:
                 if args.json:
                     print(json.dumps(figures(reading, health)), flush=True)
                 elif time.monotonic() - told_s >= 1.0:
@@ -112,7 +123,7 @@ def line(scan: LaserScan, health: DeviceHealth) -> str:
     bars = "".join(BARS[min(len(BARS) - 1, int(np.ceil(s * (len(BARS) - 1))))] for s in share)
     rate = f"{health.rate_hz:5.1f}" if health.rate_hz else "    -"  # of a single scan there is none
     return (
-        f"{health.model:<14} {health.state.value:<8} {rate} Hz {facts['points']:5d} points "
+        f"{health.model:<15} {health.state.value:<8} {rate} Hz {facts['points']:5d} points "
         f"{facts['coverage']:4.0%} of the circle  nearest {facts['nearest_m']} m  0 {bars} {scan.range_max_m:g} m"
         + (f"  {health.bad_frames} bad frames" if health.bad_frames else "")
     )

@@ -42,7 +42,7 @@ def test_options_reach_their_driver() -> None:
         ("ld06:/dev/x?baud=9600.5", "whole number"),
         ("rplidar:/dev/x?mode=turbo", "must be one of auto, standard"),
         ("ld06:/dev/x?baud", "options are written"),
-        ("wheels:/dev/ttyACM0", "open it as the other kind"),
+        ("wheels:/dev/ttyACM0", "it is a wheel base: --wheels wheels"),
     ],
 )
 def test_a_wrong_url_says_what_is_wrong(url: str, says: str) -> None:
@@ -51,7 +51,7 @@ def test_a_wrong_url_says_what_is_wrong(url: str, says: str) -> None:
 
 
 def test_a_lidar_is_no_base() -> None:
-    with pytest.raises(DeviceConfigError, match="open it as the other kind"):
+    with pytest.raises(DeviceConfigError, match="it is a LIDAR: --lidar ld06"):
         open_wheels("ld06:/dev/ttyUSB0")
     with pytest.raises(DeviceConfigError, match="radius, track missing"):
         open_wheels("wheels:/dev/ttyACM0?ticks=1000")

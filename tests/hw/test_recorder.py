@@ -51,6 +51,22 @@ def test_a_replay_shows_the_scans_the_device_saw(tmp_path: Path) -> None:
     assert all(scan.ranges_m.tobytes() == truth[0].ranges_m.tobytes() for scan in scans)
 
 
+def test_a_pause_in_a_recording_is_waited_out(tmp_path: Path) -> None:
+    """The description of an RPLIDAR's stream comes once, at its beginning: nothing may make the driver forget it."""
+    stream = STREAMS["rplidar-0x85"](seconds=1.0)
+    with Recorder(tmp_path / "a.rec", "rplidar:/dev/ttyUSB0") as recorder:
+        recorder(50.0, stream.prefix + stream.data)
+        recorder(51.0, stream.data)
+    device = open_lidar(f"replay:{tmp_path / 'a.rec'}").start()
+    scans = 0
+    while device.read(3.0) is not None:
+        scans += 1
+    health = device.health()
+    device.stop()
+    assert "at its end" in health.last_error
+    assert (health.stalls, health.dropped + scans) == (0, len(decode(stream, stream.prefix + 2 * stream.data)))
+
+
 def test_an_endless_replay_goes_on(tmp_path: Path) -> None:
     device = open_lidar(f"replay:{_record(tmp_path / 'a.rec')}?speed=20&loop=1").start()
     try:

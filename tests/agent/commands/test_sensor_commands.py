@@ -41,6 +41,16 @@ def test_a_person_gets_one_line_a_second(lidar: SerialDevice, capsys: pytest.Cap
     assert "LD06" in out and "450 points" in out and "100% of the circle" in out
 
 
+def test_scan_tells_where_wheels_say_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with SerialDevice("kobuki", tmp_path / "base") as base:
+        assert main(["scan", f"kobuki:{base.link}", "-n", "30", "--json"]) == 0
+        last = json.loads(capsys.readouterr().out.splitlines()[-1])
+        assert last["x_m"] > 0.05 and last["way_m"] == pytest.approx(last["x_m"], rel=0.02) and last["jumps"] == 0
+        assert main(["scan", f"kobuki:{base.link}", "-n", "1"]) == 0
+        assert "0 jumps" in capsys.readouterr().out
+        assert main(["scan", f"kobuki:{base.link}", "--png", str(tmp_path / "x.png")]) == 2
+
+
 def test_record_and_replay(lidar: SerialDevice, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "a.rec"
     assert main(["record", f"ld06:{lidar.link}", str(file), "--seconds", "1.2"]) == 0
@@ -56,6 +66,13 @@ def test_devices_says_who_answers(lidar: SerialDevice, capsys: pytest.CaptureFix
     assert (found[0]["url"], found[0]["kind"], found[0]["model"]) == (f"ld06:{lidar.link}", "lidar", "LD06")
     assert main(["devices", "--probe", "--as", "xv11", str(lidar.link)]) == 1
     assert "nobody we know answers" in capsys.readouterr().out
+
+
+def test_a_probe_for_what_cannot_be_found_ends_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["devices", "--probe", "--as", "ld07", str(tmp_path)]) == 2
+    assert "no such kind; there are" in capsys.readouterr().err
+    assert main(["devices", "--probe", f"{tmp_path}/none"]) == 1
+    assert "none: no such port" in capsys.readouterr().err
 
 
 def test_what_cannot_work_is_said_in_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
