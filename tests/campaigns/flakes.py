@@ -1,9 +1,10 @@
 """C12, the flake hunt: the default tests again and again, in random order, with random inputs, beside a busy neighbour.
 
-    .venv/bin/python -m tests.campaigns.flakes [--rounds 50] [--hogs 0] [--seed 1] [--json] [-- PYTEST ARGUMENTS]
+    .venv/bin/python -m tests.campaigns.flakes [--rounds 50] [--hogs 0] [--seed 1] [--store FILE] [--json] [-- PYTEST ARGUMENTS]
 
 Every test that failed in any round is listed with how often and why; what fails always is broken, what fails sometimes is a
-flake, and both are our bugs.  `--hogs` processes do nothing but compute meanwhile.
+flake, and both are our bugs.  `--hogs` processes do nothing but compute meanwhile.  With `--store` every round is a line that
+is appended to FILE when it ends: a hunt that was stopped goes on where it was, until there are as many rounds as asked for.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import time
 import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from tests.bench.tables import markdown
@@ -34,52 +36,68 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--rounds", type=int, default=50)
     parser.add_argument("--hogs", type=int, default=0)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--store", type=Path, help="where rounds are kept: the hunt may be stopped and gone on with")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("pytest", nargs="*", help="what to run instead of everything")
     args = parser.parse_args(argv)
-    rng = random.Random(args.seed)
-    failed: Counter[str] = Counter()
-    reasons: dict[str, str] = {}
-    tests, started, loads = 0, time.monotonic(), []
+    rounds = stored(args.store)
     with busy(args.hogs):
-        for number in range(args.rounds):
-            seed = rng.randrange(2**31)
-            count, failures = one_round(seed, args.pytest)
-            tests += count
-            loads.append(os.getloadavg()[0])
-            failed.update(failures.keys())
-            reasons |= failures
-            print(f"round {number + 1}, seed {seed}: {count} tests, load {loads[-1]:.0f}, failed: {failures}", file=sys.stderr)
-    figures = {
-        "rounds": args.rounds,
-        "tests run": tests,
-        "load": round(sum(loads) / len(loads), 1),
-        "minutes": round((time.monotonic() - started) / 60, 1),
-        "failed ever": {name: [n, reasons[name]] for name, n in failed.most_common()},
-    }
-    print(json.dumps(figures, indent=1) if args.json else table(figures, failed, reasons))
-    return 1 if failed or not tests else 0
+        while len(rounds) < args.rounds:
+            rounds.append(one_round(random.Random(f"{args.seed}/{len(rounds)}").randrange(2**31), args.pytest))
+            keep(args.store, rounds[-1])
+            print(f"round {len(rounds)}: {json.dumps(asdict(rounds[-1]))}", file=sys.stderr, flush=True)
+    print(json.dumps([asdict(each) for each in rounds], indent=1) if args.json else table(rounds))
+    return 1 if any(each.failed for each in rounds) else 0
 
 
-def one_round(seed: int, words: list[str]) -> tuple[int, dict[str, str]]:
-    """How many tests ran; those that failed, each with the first words of why."""
+@dataclass(frozen=True)
+class Round:
+    """All tests once."""
+
+    seed: int
+    tests: int
+    load: float
+    minutes: float
+    failed: dict[str, str]  # by test: the first words of why
+
+
+def stored(store: Path | None) -> list[Round]:
+    """The rounds of earlier runs."""
+    if store is None or not store.is_file():
+        return []
+    return [Round(**json.loads(line)) for line in store.read_text().splitlines()]
+
+
+def keep(store: Path | None, done: Round) -> None:
+    if store is not None:
+        store.parent.mkdir(parents=True, exist_ok=True)
+        with store.open("a") as file:
+            file.write(json.dumps(asdict(done)) + "\n")
+
+
+def one_round(seed: int, words: list[str]) -> Round:
+    """Every test that is chosen, in an order and with inputs of this seed."""
+    started = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "report.xml"
         command = [sys.executable, "-m", "pytest", "-n", "2", "-p", "tests.harness.shuffled", f"--hypothesis-seed={seed}"]
-        subprocess.run(
+        done = subprocess.run(
             [*command, f"--junitxml={report}", *words],
             cwd=ROOT,
             env={**os.environ, "MAPQUILT_SHUFFLE": str(seed)},
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
             check=False,
         )
-        cases = list(ET.parse(report).getroot().iter("testcase"))
-    failures = {}
-    for case in cases:
-        for outcome in (*case.findall("failure"), *case.findall("error")):
-            failures[f"{case.get('classname')}::{case.get('name')}"] = (outcome.get("message") or "")[:REASON_CHARS]
-    return len(cases), failures
+        cases = list(ET.parse(report).getroot().iter("testcase")) if report.is_file() else []
+    failed = {
+        f"{case.get('classname')}::{case.get('name')}": (outcome.get("message") or "")[:REASON_CHARS]
+        for case in cases
+        for outcome in (*case.findall("failure"), *case.findall("error"))
+    }
+    if not cases:
+        failed["pytest itself"] = done.stdout[-REASON_CHARS:]
+    return Round(seed, len(cases), round(os.getloadavg()[2], 1), round((time.monotonic() - started) / 60, 1), failed)
 
 
 @contextlib.contextmanager
@@ -100,8 +118,16 @@ def _compute() -> None:
         sum(range(100_000))
 
 
-def table(figures: dict[str, object], failed: Counter[str], reasons: dict[str, str]) -> str:
-    row = {name: figures[name] for name in ("rounds", "tests run", "load", "minutes")} | {"failed ever": len(failed)}
+def table(rounds: list[Round]) -> str:
+    failed = Counter(name for each in rounds for name in each.failed)
+    reasons = {name: why for each in rounds for name, why in each.failed.items()}
+    row = {
+        "rounds": len(rounds),
+        "tests run": sum(each.tests for each in rounds),
+        "load": round(sum(each.load for each in rounds) / max(1, len(rounds)), 1),
+        "minutes": round(sum(each.minutes for each in rounds), 1),
+        "failed ever": len(failed),
+    }
     return "\n".join([markdown([row]), *(f"- {name}: {n} times: {reasons[name]}" for name, n in failed.most_common())])
 
 
