@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from agent.commands.files import loaded_map, written_file
-from agent.commands.merge_files import LoadedMap, Merged, pair_picture
+from agent.commands.merge_files import LoadedMap, Merged, xyt
+from agent.commands.merge_output import pair_picture
 from agent.exits import NEGATIVE, OK, PEER, CommandError
 from agent.features.snapshot import MapSnapshot
 from agent.merging.arrays import without_canvas
@@ -81,16 +82,16 @@ def as_json(result: MergeResult, T_local_robot: SE2 | None) -> dict[str, Any]:
         "found": result.accepted,
         "status": str(result.status),
         "reason": result.reason,
-        **_xyt(T),
+        **xyt(T),
         "covariance": np.round(result.covariance, 10).tolist() if T is not None else None,
         "match_factor": round(result.factor.value, 5),
         "overlap_m2": round(result.overlap_m2, 3),
         "score": round(result.score, 3),
         "runner_up_score": round(result.runner_up_score, 3),
-        "alternatives": [{**_xyt(a.T_ours_theirs), "score": round(a.score, 3)} for a in result.alternatives],
+        "alternatives": [{**xyt(a.T_ours_theirs), "score": round(a.score, 3)} for a in result.alternatives],
     }
     if T is not None and T_local_robot is not None:
-        answer["robot"] = _xyt(T @ T_local_robot)
+        answer["robot"] = xyt(T @ T_local_robot)
     return answer
 
 
@@ -107,12 +108,6 @@ def as_text(answer: dict[str, Any], given: str, local: str) -> str:
 
 def _place(pose: dict[str, Any]) -> str:
     return f"x {pose['x']:.3f} m, y {pose['y']:.3f} m, {np.degrees(pose['theta']):.2f} deg"
-
-
-def _xyt(T: SE2 | None) -> dict[str, float | None]:
-    if T is None:
-        return {"x": None, "y": None, "theta": None}
-    return {"x": round(T.x_m, 5), "y": round(T.y_m, 5), "theta": round(T.theta_rad, 6)}
 
 
 def _picture(given: LoadedMap, local: LoadedMap, result: MergeResult) -> bytes:

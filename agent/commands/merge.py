@@ -12,7 +12,8 @@ import sys
 from pathlib import Path
 
 from agent.commands.files import loaded_map, writable
-from agent.commands.merge_files import LoadedMap, Merged, merge_files, write_merged
+from agent.commands.merge_files import LoadedMap, Merged, merge_files
+from agent.commands.merge_output import write_merged
 from agent.exits import BAD_INPUT, ENVIRONMENT, NEGATIVE, OK, USAGE, CommandError
 from agent.merging.errors import FusionError
 from agent.merging.result import MatchOptions

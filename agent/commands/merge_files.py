@@ -1,4 +1,4 @@
-"""What `mapquilt merge` does with loaded maps: match every pair, lay out those that fit, fuse, draw, and say it.
+"""What `mapquilt merge` does with loaded maps: match every pair, lay out those that fit, and say it.
 
 While matching, every map lives in the frame of its own lower-left corner, as nav_msgs has it; the origins of the YAML files come
 in at the very end, when the transform between the files' own map frames is told and the merged map is written in the first one's.
@@ -9,28 +9,19 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agent.features.snapshot import MapSnapshot
-from agent.files import write_atomically
 from agent.fleet.frame_graph import Edge, solve
-from agent.map_files import save_map
 from agent.merging.arrays import at_corner, without_canvas
-from agent.merging.errors import FusionError
-from agent.merging.fusion import FusedMap, fuse
-from agent.merging.matched_features import matched_features
+from agent.merging.fusion import FusedMap
 from agent.merging.matching import match_maps
-from agent.merging.resampling import resampled_like
 from agent.merging.result import MatchOptions, MatchStatus, MergeResult
-from agent.view.group_picture import Member, group_picture
-from agent.view.merge_picture import MapToDraw, Overlay, merge_picture
-from agent.view.render import png
 from protocol.geometry import SE2
 from protocol.grid import OccupancyGrid
 
@@ -69,7 +60,7 @@ class Merged:
         answer = {"method": self.options.method, **self._pair_json((0, 1))}
         answer["accepted"] = self.is_complete
         if 1 in self.T_first:
-            answer.update(_xyt(self.T_first[1]), map_frame=_xyt(self._between_files(0, 1, self.T_first[1])))
+            answer.update(xyt(self.T_first[1]), map_frame=xyt(self._between_files(0, 1, self.T_first[1])))
         if len(self.maps) > 2:
             answer["maps"] = [self._map_json(i) for i in range(len(self.maps))]
             answer["pairs"] = [self._pair_json(pair) for pair in self.results]
@@ -83,7 +74,7 @@ class Merged:
 
     def _map_json(self, i: int) -> dict[str, Any]:
         T = self.T_first.get(i)
-        placed = {} if T is None else {**_xyt(T), "map_frame": _xyt(self._between_files(0, i, T))}
+        placed = {} if T is None else {**xyt(T), "map_frame": xyt(self._between_files(0, i, T))}
         return {"map": self.maps[i].name, "joined": T is not None, **placed}
 
     def _pair_json(self, pair: Pair) -> dict[str, Any]:
@@ -96,7 +87,7 @@ class Merged:
             "accepted": result.accepted and pair not in self.inconsistent,
             "status": str(result.status),
             "reason": "inconsistent with the other maps" if pair in self.inconsistent else result.reason,
-            **_xyt(T),
+            **xyt(T),
             "covariance": np.round(result.covariance, 10).tolist() if known else None,
             "score": _rounded(result.score),
             "runner_up_score": _rounded(result.runner_up_score),
@@ -106,8 +97,8 @@ class Merged:
             "overlap_m2": _rounded(result.overlap_m2),
             "candidates_tried": result.candidates_tried,
             "evidence": {name: _rounded(value) for name, value in result.evidence.items()},
-            "alternatives": [{**_xyt(other.T_ours_theirs), "score": _rounded(other.score)} for other in result.alternatives],
-            "map_frame": _xyt(self._between_files(*pair, T)) if T is not None else None,
+            "alternatives": [{**xyt(other.T_ours_theirs), "score": _rounded(other.score)} for other in result.alternatives],
+            "map_frame": xyt(self._between_files(*pair, T)) if T is not None else None,
         }
 
     def _between_files(self, i: int, j: int, T_corners: SE2) -> SE2:
@@ -115,7 +106,7 @@ class Merged:
         return self.maps[i].grid.origin @ T_corners @ self.maps[j].grid.origin.inverse()
 
     def as_text(self) -> str:
-        lines = [f"{self.verdict(pair)} ({', '.join(_figures(result))})" for pair, result in self.results.items()]
+        lines = [f"{self.verdict(pair)} ({', '.join(figures_of(result))})" for pair, result in self.results.items()]
         return "\n".join([self.outcome(), *lines] if len(self.maps) > 2 else lines)
 
     def outcome(self) -> str:
@@ -169,90 +160,7 @@ def _edge(pair: Pair, result: MergeResult) -> Edge:
     return Edge(_name(i), _name(j), result.T_ours_theirs, covariance, result.score, f"{i},{j}".encode())
 
 
-def write_merged(merged: Merged, output: Path, resolution_m: float | None) -> list[Path]:
-    """The fused map in the first map's frame, and a picture of every pair that has a hypothesis; returns what was written."""
-    base = output.with_suffix("") if output.suffix in (".yaml", ".yml", ".pgm", ".png") else output
-    written: list[Path] = []
-    if len(merged.T_first) > 1:
-        merged.fused = _fused_in_first_frame(merged, resolution_m)
-        written += save_map(merged.fused.grid, base)
-    for i, j in merged.results:
-        name = base.name if len(merged.maps) == 2 else f"{base.name}-{i + 1}-{j + 1}"
-        path = base.with_name(f"{name}.png")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, png(pair_picture(merged, (i, j))))
-        written.append(path)
-    if merged.fused is not None and len(merged.maps) > 2:
-        path = base.with_name(f"{base.name}.png")
-        write_atomically(path, png(all_together(merged, merged.fused)))
-        written.append(path)
-    return written
-
-
-def _fused_in_first_frame(merged: Merged, resolution_m: float | None) -> FusedMap:
-    """On the first map's own lattice, so that its cells stay as they are; a map whose frame is turned is drawn upright."""
-    first = merged.maps[0].grid.origin
-    T_lattice_corner = _lattice(merged)
-    laid = [(at_corner(merged.maps[i].grid), T_lattice_corner @ T) for i, T in sorted(merged.T_first.items())]
-    fused = fuse(laid, resolution_m)
-    if first.theta_rad != 0:
-        return fused
-    return replace(fused, grid=replace(fused.grid, origin=first @ fused.grid.origin))
-
-
-def all_together(merged: Merged, fused: FusedMap) -> NDArray[np.uint8]:
-    """Every map by itself, and those that joined on one sheet."""
-    first, T_lattice_corner = merged.maps[0].grid.origin, _lattice(merged)
-    T_lattice_file = T_lattice_corner @ first.inverse()
-    on_lattice = replace(fused.grid, origin=T_lattice_file @ fused.grid.origin)
-    members = []
-    for i, loaded in enumerate(merged.maps):
-        corner, T = at_corner(loaded.grid), merged.T_first.get(i)
-        laid = None if T is None else resampled_like(on_lattice, corner, T_lattice_corner @ T)
-        members.append(Member(Path(loaded.name).name, corner, laid))
-    figures = [f"{fused.grid.known_area_m2():.0f} m2 known", f"{fused.conflicting_cells} cells conflict"]
-    return group_picture(members, fused.grid, fused.conflicts, figures)
-
-
-def _lattice(merged: Merged) -> SE2:
-    """Where the first map's corner lies on the merged lattice: on its own cells, or upright when its frame is turned."""
-    first = merged.maps[0].grid.origin
-    return SE2.identity() if first.theta_rad == 0 else first
-
-
-def pair_picture(merged: Merged, pair: Pair) -> NDArray[np.uint8]:
-    """Before and after: both maps with their features, and theirs laid on ours at the best hypothesis."""
-    a, b = (merged.maps[i] for i in pair)
-    result = merged.results[pair]
-    T = result.T_ours_theirs
-    if T is None:
-        return merge_picture(_to_draw(a, {}), _to_draw(b, {}), None, merged.verdict(pair), _figures(result))
-    same = matched_features(a.snapshot.features, b.snapshot.features, T)
-    kinds = {"lines": same.lines, "circles": same.circles, "arcs": same.arcs, "curves": same.curves}
-    longest_first = np.argsort(-a.snapshot.features.lines[same.lines[:, 0], 3], kind="stable")
-    kinds["lines"] = same.lines[longest_first]
-    ours = _to_draw(a, {kind: rows[:, 0].tolist() for kind, rows in kinds.items()})
-    theirs = _to_draw(b, {kind: rows[:, 1].tolist() for kind, rows in kinds.items()})
-    verdict = merged.verdict(pair) + ("" if result.accepted else "; below, the best hypothesis")
-    return merge_picture(ours, theirs, _overlay(a, b, T), verdict, [*_figures(result), f"{len(same)} matched features"])
-
-
-def _to_draw(loaded: LoadedMap, matched: Mapping[str, list[int]]) -> MapToDraw:
-    everything = {kind: matched.get(kind, []) for kind in ("lines", "circles", "arcs", "curves")}
-    return MapToDraw(Path(loaded.name).name, loaded.snapshot.grid, loaded.snapshot.features, everything)
-
-
-def _overlay(a: LoadedMap, b: LoadedMap, T: SE2) -> Overlay | None:
-    ours, theirs = a.snapshot.grid, b.snapshot.grid
-    try:
-        fused = fuse([(ours, SE2.identity()), (theirs, T)])
-    except FusionError:  # a rejected hypothesis may lie kilometres away: nothing to see there
-        return None
-    cells = [resampled_like(fused.grid, grid, T_frame) for grid, T_frame in ((ours, SE2.identity()), (theirs, T))]
-    return Overlay(fused.grid, cells[0], cells[1], fused.conflicts, SE2.identity(), T)
-
-
-def _figures(result: MergeResult) -> list[str]:
+def figures_of(result: MergeResult) -> list[str]:
     factor = result.factor
     return [
         f"match factor {factor.value:.3f}",
@@ -261,7 +169,7 @@ def _figures(result: MergeResult) -> list[str]:
     ]
 
 
-def _xyt(T: SE2 | None) -> dict[str, float | None]:
+def xyt(T: SE2 | None) -> dict[str, float | None]:
     if T is None:
         return {"x": None, "y": None, "theta": None}
     return {"x": round(T.x_m, 6), "y": round(T.y_m, 6), "theta": round(T.theta_rad, 8)}
