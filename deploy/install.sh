@@ -136,6 +136,11 @@ place_help() {
     "$home/.venv/bin/mapquilt" completion man >"$page"
 }
 
+# A robot that runs would load new files beside the old ones it holds.
+restart_running() {
+    ! systemd_runs || systemctl try-restart 'mapquilt@*.service'
+}
+
 start_service() {
     if ! systemd_runs; then
         say "no systemd runs here; start it by hand: mapquilt run --id $robot --config /etc/mapquilt/robot.toml"
@@ -171,5 +176,6 @@ place_program
 place_packages
 place_settings
 place_system
+restart_running
 say "installed in $home; settings: $settings/robot.toml; check this machine with: mapquilt doctor"
 [ -z "$robot" ] || start_service
