@@ -15,7 +15,7 @@ from agent.config import state_dir
 from agent.config_flags import add_config_arguments, load_from
 from agent.exits import BAD_INPUT, OK, CommandError
 from agent.mapping.mapper import Mapper
-from agent.runtime.node import mapping_options
+from agent.runtime.settings import mapping_options
 from agent.runtime.state import StateDirectory
 from agent.view.render import map_picture, png
 from agent.view.report_page import RobotReport, report_page

@@ -6,16 +6,15 @@ import argparse
 import contextlib
 import json
 import os
-import threading
 
-from agent.commands.run import StopSignals, die_with_parent
+from agent.commands.network import on_the_network
+from agent.commands.run import die_with_parent
 from agent.config_flags import NETWORK, add_config_arguments, load_from
-from agent.exits import OK, PEER, USAGE, CommandError
-from agent.runtime.exchange import Exchange, ExchangeError
+from agent.exits import OK
+from agent.runtime.exchange import Exchange
 from agent.runtime.health import Notifier
 from agent.runtime.log_setup import set_up_logging
-from agent.runtime.network import NetworkConfigError
-from agent.runtime.node import network_settings
+from agent.runtime.settings import network_settings
 
 EXAMPLES = """\
   mapquilt router --listen tcp/0.0.0.0:7447 --security mtls
@@ -35,21 +34,13 @@ def run(args: argparse.Namespace) -> int:
     set_up_logging(config.log.level, config.robot.id)
     if args.die_with_parent:
         die_with_parent(args.die_with_parent)
-    stopping = threading.Event()
-    StopSignals().then(stopping.set)
-    try:
-        settings = network_settings(config, is_router=True)
-        with Exchange(settings, lambda _: None) as exchange:
-            locators = exchange.locators()
-            if args.ready_json:
-                print(json.dumps({"ready": True, "pid": os.getpid(), "locators": locators}), flush=True)
-            elif not args.quiet:
-                print(f"router at {', '.join(locators)}", flush=True)
-            Notifier().send("READY=1")
-            with contextlib.suppress(KeyboardInterrupt):
-                stopping.wait()
-    except NetworkConfigError as error:
-        raise CommandError(str(error), USAGE) from error
-    except ExchangeError as error:
-        raise CommandError(str(error), PEER) from error
+    with on_the_network() as stopping, Exchange(network_settings(config, is_router=True), lambda _: None) as exchange:
+        locators = exchange.locators()
+        if args.ready_json:
+            print(json.dumps({"ready": True, "pid": os.getpid(), "locators": locators}), flush=True)
+        elif not args.quiet:
+            print(f"router at {', '.join(locators)}", flush=True)
+        Notifier().send("READY=1")
+        with contextlib.suppress(KeyboardInterrupt):
+            stopping.wait()
     return OK

@@ -11,16 +11,14 @@ import json
 import os
 import secrets
 import sys
-import threading
 from dataclasses import replace
 
-from agent.commands.run import StopSignals, join_ros2, serve_page
+from agent.commands.network import on_the_network
+from agent.commands.run import join_ros2, serve_page
 from agent.config_flags import NETWORK, add_config_arguments, load_from
-from agent.exits import OK, PEER, USAGE, CommandError
-from agent.runtime.exchange import ExchangeError
+from agent.exits import OK, USAGE, CommandError
 from agent.runtime.log_setup import set_up_logging
-from agent.runtime.network import NetworkConfigError
-from agent.runtime.node import network_settings
+from agent.runtime.settings import network_settings
 from agent.runtime.watcher import Watcher
 
 EXAMPLES = """\
@@ -42,23 +40,15 @@ def run(args: argparse.Namespace) -> int:
         name = config.robot.id  # a certificate names its holder: enroll the laptop as a member
     config = replace(config, robot=replace(config.robot, id=name))
     set_up_logging("warning" if not args.verbose else "info", name)
-    stopping = threading.Event()
-    StopSignals().then(stopping.set)
-    try:
-        watcher = Watcher(network_settings(config))
-        with watcher, contextlib.ExitStack() as stack:
-            page = serve_page(watcher, config)
-            if page is None:
-                raise CommandError(f"no free port from {config.view.port} on; give another with --view-port", USAGE)
-            stack.callback(page.close)
-            join_ros2(watcher, config, stack)
-            if args.ready_json:
-                print(json.dumps({"ready": True, "robot": name, "pid": os.getpid(), "page": page.url}), flush=True)
-            else:
-                print(f"the fleet is at {page.url} until Ctrl-C", file=sys.stderr)
-            stopping.wait()
-    except NetworkConfigError as error:
-        raise CommandError(str(error), USAGE) from error
-    except ExchangeError as error:
-        raise CommandError(str(error), PEER) from error
+    with on_the_network() as stopping, Watcher(network_settings(config)) as watcher, contextlib.ExitStack() as stack:
+        page = serve_page(watcher, config)
+        if page is None:
+            raise CommandError(f"no free port from {config.view.port} on; give another with --view-port", USAGE)
+        stack.callback(page.close)
+        join_ros2(watcher, config, stack)
+        if args.ready_json:
+            print(json.dumps({"ready": True, "robot": name, "pid": os.getpid(), "page": page.url}), flush=True)
+        else:
+            print(f"the fleet is at {page.url} until Ctrl-C", file=sys.stderr)
+        stopping.wait()
     return OK

@@ -42,10 +42,6 @@ class Fetching:
         self._running[name] = (fetch, now_s)
         self._ledger.effects.append(fetch)
 
-    def pause(self, peer: str, subject: str, until_s: float) -> None:
-        """Do not pull this before then."""
-        self._patience.setdefault((peer, subject), _Patience()).not_before_s = until_s
-
     def done(self, fetch: Fetch, is_good: bool, now_s: float) -> str | None:
         """Take the answer in; its subject, or None when nobody waits for it any more."""
         name = next((name for name, (running, _) in self._running.items() if running.id == fetch.id), None)

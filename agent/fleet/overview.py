@@ -63,7 +63,6 @@ class Overview:
             peer.is_unmerged,
             peer.map,
             peer.known_area_m2,
-            peer.held is not None and peer.held == peer.map,
             beat.load if beat else 0.0,
             round(peer.trust.strikes),
             frame.T_global_map @ T_map_robot if frame is not None and T_map_robot is not None else None,

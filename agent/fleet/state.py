@@ -28,7 +28,6 @@ class PeerState:
     is_unmerged: bool  # by the operator, with `unmerge`
     map: MapVersion | None
     known_area_m2: float
-    holds_fine: bool  # its cells are here
     load: float
     strikes: int
     T_global_robot: SE2 | None

@@ -15,7 +15,7 @@ from typing import Any
 import zenoh
 import zenoh.ext
 
-from agent.runtime.exchange import ExchangeError
+from agent.runtime.exchange import ExchangeError, close
 
 log = logging.getLogger(__name__)
 
@@ -68,9 +68,5 @@ class Announcer:
     def close(self) -> None:
         """Never raises; everything announced is taken back with the session."""
         session, self._session = self._session, None
-        if session is not None:
-            try:
-                session.close()
-            except zenoh.ZError as error:
-                log.warning("network: the session did not close cleanly: %s", error)
+        close(session)
         self._held.clear()

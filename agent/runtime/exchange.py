@@ -23,10 +23,10 @@ import zenoh
 
 from agent.runtime.latest import KeyedLatest
 from agent.runtime.network import NetworkSettings, zenoh_config
+from agent.runtime.pending import MAX_PAYLOAD_BYTES, Pending
 
 log = logging.getLogger(__name__)
 
-MAX_PAYLOAD_BYTES = 32 * 1024  # hints are made for 16 KB, plus envelope; a single 200 KB put is silently lost on 20 Mbit/s
 QUERY_TIMEOUT_S = 5.0
 ASK_AGAIN_S = 1.5  # a question that went into a link just before it came back stays unanswered
 SLOW_FACTOR = 3.0  # over a slow radio the second question waits for this many times the time the last answer took
@@ -39,7 +39,6 @@ Answer = Callable[[str], "bytes | None"]  # key -> the register's content, ready
 class Traffic:
     """What passed through the door since the start."""
 
-    sent_messages: int = 0
     sent_bytes: int = 0
     received_messages: int = 0
     received_bytes: int = 0
@@ -48,42 +47,6 @@ class Traffic:
     refused: int = 0  # too large
     unanswered: int = 0
     dropped_queries: int = 0
-
-
-class Pending:
-    """A question on its way, asked once more when it stays silent.  Filled on Zenoh's thread; `wait` from a worker."""
-
-    def __init__(self, ask: Callable[[Pending], bool]) -> None:
-        self._arrived: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._ask = ask
-        self._asked = 1
-        self._ended = self._count = 0
-
-    def on_reply(self, reply: Any) -> None:
-        self._count += 1
-        if self._count <= 4:  # one is expected; a liar may send many
-            self._arrived.put(reply)
-
-    def on_end(self) -> None:
-        self._arrived.put(None)
-
-    def wait(self, timeout_s: float, again_s: float, stopping: threading.Event) -> bytes | None:
-        """The first good answer; None when there was none (an empty reply list is how Zenoh says that nobody is there)."""
-        started_s = time.monotonic()
-        while not stopping.is_set() and (waited_s := time.monotonic() - started_s) < timeout_s:
-            if waited_s >= again_s and self._asked == 1 and self._ask(self):
-                self._asked = 2
-            try:
-                reply = self._arrived.get(timeout=0.2)
-            except queue.Empty:
-                continue
-            if reply is None:
-                self._ended += 1
-                if self._ended == self._asked:
-                    return None
-            elif reply.ok is not None and len(reply.ok.payload) <= MAX_PAYLOAD_BYTES:
-                return bytes(reply.ok.payload.to_bytes())
-        return None
 
 
 class Exchange:
@@ -171,11 +134,7 @@ class Exchange:
 
     def _close_session(self) -> None:
         session, self._session = self._session, None
-        if session is not None:
-            try:
-                session.close()
-            except zenoh.ZError as error:
-                log.warning("network: the session did not close cleanly: %s", error)
+        close(session)
 
     # Callbacks: on Zenoh's thread, one bounded enqueue each.
 
@@ -214,7 +173,6 @@ class Exchange:
         except zenoh.ZError as error:
             log.debug("put %s: %s", key, error)
             return False
-        self.traffic.sent_messages += 1
         self.traffic.sent_bytes += len(payload)
         return True
 
@@ -303,3 +261,12 @@ class Exchange:
 
 class ExchangeError(Exception):
     """The network could not be opened: the program says so and stops, because a dead mesh looks healthy from inside."""
+
+
+def close(session: Any) -> None:
+    """Close a Zenoh session, if there is one.  Never raises."""
+    if session is not None:
+        try:
+            session.close()
+        except zenoh.ZError as error:
+            log.warning("network: the session did not close cleanly: %s", error)

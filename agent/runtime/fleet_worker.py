@@ -34,7 +34,6 @@ log = logging.getLogger(__name__)
 TICK_S = 0.1
 WAIT_S, PULL_WAIT_S = 0.05, 0.25
 MAX_PEER_MAPS = 32
-BULK_PULLERS, SMALL_PULLERS = 2, 3  # a silent peer holds one up for 5 s; the others go on
 
 
 class FleetWorker:

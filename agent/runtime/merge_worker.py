@@ -57,7 +57,6 @@ class MergeWorker:
         self._order = itertools.count()
         self._snapshots: OrderedDict[bytes, tuple[str, MapSnapshot]] = OrderedDict()
         self.cpu_s = 0.0
-        self.finished = 0
         self.dropped = 0
 
     def submit(self, job: Match | Fuse, on_done: OnDone) -> None:
@@ -83,7 +82,6 @@ class MergeWorker:
             done = Laid(job, fuse(job.maps, job.resolution_m)) if isinstance(job, Fuse) else Matched(job, self._match(job))
         finally:
             self.cpu_s += time.thread_time() - started
-            self.finished += 1
             on_done(done)
 
     def _match(self, job: Match) -> MergeResult:

@@ -17,13 +17,11 @@ Values only flow to the right and down; every arrow is a mailbox that never grow
 from __future__ import annotations
 
 import logging
-import math
 import secrets
 import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from agent.config import Config
 from agent.features.snapshot import MapSnapshot
@@ -32,8 +30,6 @@ from agent.fleet.memory import FleetMemory, decode_memory
 from agent.fleet.options import FleetOptions
 from agent.mapping.estimate import MapEstimate
 from agent.mapping.mapper import Mapper
-from agent.mapping.options import MappingOptions
-from agent.merging.result import MatchOptions
 from agent.runtime.control import ControlServer
 from agent.runtime.exchange import Exchange
 from agent.runtime.fleet_worker import FleetWorker
@@ -42,20 +38,18 @@ from agent.runtime.health import Health, Notifier, watchdog_period_s
 from agent.runtime.keeper import Keeper
 from agent.runtime.map_worker import MapWorker
 from agent.runtime.merge_worker import MergeWorker
-from agent.runtime.network import NetworkSettings
 from agent.runtime.own_loops import fit_in_own_map
 from agent.runtime.pace import REAL, Pace
 from agent.runtime.priors import FrozenPeer
 from agent.runtime.records import Records
 from agent.runtime.sensing import Readings, device_step
+from agent.runtime.settings import mapping_options, match_options, network_settings, wheels_url
 from agent.runtime.state import StateDirectory
 from agent.runtime.worker import Worker, WorkerReport
-from hw.device import Source, open_lidar, open_wheels, schemes
-from protocol.geometry import SE2
+from hw.device import Source, open_lidar, open_wheels
 
 log = logging.getLogger(__name__)
 
-TURN_PER_SPEED = 2.0  # rad/s a m/s: a wheel base of half a metre turns twice as fast as it drives
 STOP_WITHIN_S = 1.5  # what the workers have to come back; the whole stop stays below 2 s
 
 
@@ -110,6 +104,7 @@ class Node:
         table = [
             row("merge", self.merger.step, 120.0, "match and fuse jobs", "results"),
             row("fleet", self.fleet.step, 5.0, "messages, results, time", "messages, jobs"),
+            # A silent peer holds one puller up for 5 s; the others go on.
             *(row(f"pull-bulk-{i}", self.fleet.bulk_step, 60.0, "fetches", "pulled messages") for i in (1, 2)),
             *(row(f"pull-small-{i}", self.fleet.small_step, 60.0, "fetches", "pulled messages") for i in (1, 2, 3)),
             row("features", self._features_step, 20.0, "estimates", "own map, for the fleet"),
@@ -217,50 +212,3 @@ class Node:
 
     def reports(self) -> list[WorkerReport]:
         return [worker.report() for worker in self.workers]
-
-
-def wheels_url(config: Config) -> str:
-    """The base's URL with the geometry that the settings give; what the URL itself says is left alone."""
-    wheels, url = config.wheels, config.wheels.url
-    if url.partition(":")[0].lower() not in schemes("wheels"):
-        return url
-    options = {"ticks": wheels.ticks_per_revolution, "radius": wheels.wheel_radius_m, "track": wheels.track_m}
-    given = {name: value for name, value in options.items() if value} | {"v_max": wheels.max_speed_mps}
-    words = [f"{name}={value:g}" for name, value in given.items() if f"{name}=" not in url.partition("?")[2]]
-    return url + ("&" if "?" in url else "?") + "&".join(words) if words else url
-
-
-def mapping_options(config: Config) -> MappingOptions:
-    lidar, mapping = config.lidar, config.mapping
-    more: dict[str, Any] = {"matching_range_m": mapping.max_range_m} if mapping.max_range_m > 0.0 else {}
-    return MappingOptions(
-        resolution_m=mapping.resolution_m,
-        particles=mapping.particles,
-        max_speed_m_s=config.wheels.max_speed_mps,
-        max_turn_rad_s=TURN_PER_SPEED * config.wheels.max_speed_mps,
-        T_base_laser=SE2(lidar.mount_x_m, lidar.mount_y_m, math.radians(lidar.mount_yaw_deg)),
-        **more,
-    )
-
-
-def match_options(config: Config) -> MatchOptions:
-    matching = config.matching
-    return MatchOptions(
-        method=matching.method, min_match_factor=matching.min_match_factor, size_tolerance=matching.size_tolerance
-    )
-
-
-def network_settings(config: Config, *, is_router: bool = False) -> NetworkSettings:
-    fleet = config.fleet
-    return NetworkSettings(
-        robot=config.robot.id,
-        fleet=fleet.name,
-        profile=fleet.profile,
-        listen=fleet.listen,
-        connect=fleet.connect,
-        security=fleet.security,
-        allow_open=fleet.allow_open,
-        key_file=Path(fleet.key_file) if fleet.key_file else None,
-        certificates=Path(fleet.certificates) if fleet.certificates else None,
-        is_router=is_router,
-    ).checked()
