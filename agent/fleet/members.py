@@ -218,11 +218,11 @@ class Roster:
         return ghost.fresh_beats >= 3 and now_s - peer.beat_s > 2.0 * message.period_s
 
     def _make_room(self) -> bool:
-        """Forget the longest lost peer."""
+        """Forget the longest lost peer, of those first whose cells we never took in; who is here is not pushed out."""
         lost = [peer for peer in self.peers.values() if peer.presence is Presence.LOST]
         if not lost:
             return False
-        del self.peers[min(lost, key=lambda peer: peer.heard_s).robot]
+        del self.peers[min(lost, key=lambda peer: (peer.admitted is not None, peer.heard_s)).robot]
         return True
 
 

@@ -34,7 +34,7 @@ class FleetOptions:
     strangers_per_minute: float = 30.0  # what a fleet of any size may cost in pulled maps
     max_edges: int = 6  # per robot: enough loops to find a wrong edge, few enough to keep verified
     max_held_maps: int = 24  # larger groups take the global map from its composer instead of every member's map
-    max_peers: int = 1_024
+    max_peers: int = 1_024  # a fleet of a thousand; a table full of strangers that announce 600 lines each costs 17 MB
     min_match_factor: float = 0.85  # the paper's; equation (3)
     same_transform_m: float = 0.5  # two transforms of one pair are the same within these
     same_transform_rad: float = 0.06

@@ -10,15 +10,17 @@ import pytest
 
 from agent.fleet.coordinator import Coordinator
 from agent.fleet.effects import Fetch, Match, MatchKind, Send
+from agent.fleet.members import Roster
 from agent.fleet.options import FleetOptions
 from agent.merging.result import MatchFactor, MatchStatus, MergeResult
 from protocol.codec import encode
 from protocol.features import FeatureMap
 from protocol.geometry import SE2
-from protocol.messages import Beat, MapAnnouncement, MapVersion, Stance
+from protocol.messages import Beat, MapAnnouncement, MapVersion, Stance, Statement
 from tests.fleet.explorer import Explorer, random_world
 from tests.fleet.groups import PLACES, WORLD, edges, events, fleet_of, names
 from tests.fleet.simulation import Fleet, Node, truthful
+from tests.protocol.examples import evidence
 
 
 def test_a_wrong_search_is_refused_by_the_other_side() -> None:
@@ -184,6 +186,25 @@ def test_a_table_full_of_strangers_stays_bounded() -> None:
     for i in range(200):
         coordinator.on_message(Beat(f"x{i}", i, 1, 1.0, 1.0, None, b"", b""), 0.1 * i)
     assert len(coordinator.state(20.0).peers) == 20
+
+
+def test_statements_about_robots_that_nobody_knows_stay_bounded() -> None:
+    coordinator = Coordinator("r0", 1, FleetOptions(max_peers=20))
+    coordinator.on_message(Beat("x", 1, 1, 1.0, 1.0, None, b"", b""), 0.0)
+    for i in range(200):
+        coordinator.on_message(Statement("x", 1, i + 1, f"y{i}", Stance.PROPOSE, evidence()), 0.1)
+    assert coordinator.counts["statements about too many"] == 180
+
+
+def test_a_full_table_forgets_lost_strangers_before_lost_members() -> None:
+    roster = Roster(FleetOptions(max_peers=2))
+    for robot in ("member", "stranger"):
+        roster.hear(Beat(robot, 1, 1, 1.0, 1.0, None, b"", b""), 0.0 if robot == "member" else 1.0)
+    assert roster.hear(Beat("new", 1, 1, 1.0, 1.0, None, b"", b""), 2.0) is None
+    roster.peers["member"].admitted = MapVersion(1, 1, bytes(16))
+    roster.update_presence(100.0)
+    roster.hear(Beat("new", 1, 1, 1.0, 1.0, None, b"", b""), 100.0)
+    assert set(roster.peers) == {"member", "new"}
 
 
 def test_in_a_fleet_larger_than_one_turn_the_most_alike_is_looked_at_first() -> None:
