@@ -14,7 +14,7 @@ from hw.odometry import Quiet, TickSample, WheelGeometry
 
 HEADER = b"\x13"
 START, SAFE, STREAM, PAUSE_STREAM = 128, 131, 148, 150
-BUMPS, LEFT_ENCODER, RIGHT_ENCODER = 7, 43, 44
+LEFT_ENCODER, RIGHT_ENCODER = 43, 44
 _WORDS = (19, 20, 22, 23, *range(25, 32), 33, *range(39, 45), *range(46, 52), *range(54, 58))
 SIZES = {packet: 2 if packet in _WORDS else 1 for packet in range(7, 59)}  # bytes of each sensor packet
 _SPANS = {0: (7, 26), 1: (7, 16), 2: (17, 20), 3: (21, 26), 4: (27, 34), 5: (35, 42), 6: (7, 42)}

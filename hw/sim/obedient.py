@@ -37,8 +37,9 @@ class _Leg:
 class ObedientRobot:
     """`PoseSource` of its LIDARs and `Counter` of its base."""
 
-    def __init__(self, world: World, pose: SE2, drive: DriveOptions) -> None:
+    def __init__(self, world: World, pose: SE2, drive: DriveOptions | None = None) -> None:
         self.world = world
+        drive = drive or DriveOptions()
         self._track_m = drive.track_m
         self._ticks_per_m = drive.ticks_per_revolution / (math.tau * drive.wheel_radius_m)
         self._legs = [_Leg(-math.inf, pose, (0.0, 0.0), (0.0, 0.0))]

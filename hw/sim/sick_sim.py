@@ -17,7 +17,7 @@ OK, FAILED = b"\xa0\x00\x10", b"\xa0\x02\x10"
 INSTALLATION = 0x00
 WAYS = (sick_lms.CONTINUOUS[1], sick_lms.POLLED[1], sick_lms.PARTIAL[1])  # of sending scans
 UNIT_AT, MEASURING_MODE_AT = 6, 5  # in the configuration
-RANGE_32_M, RANGE_8_OR_80_M = 6, 0  # measuring modes: in millimetres the second reaches 8 metres
+RANGE_32_M = 6  # a measuring mode; in the others, in millimetres, it reaches 8 metres
 CONFIG = bytes((0, 0, 70, 0, 0, RANGE_32_M, 1)) + bytes(27)
 STATUS_BYTES = 152
 

@@ -33,17 +33,6 @@ class PoseSource(Protocol):
         ...
 
 
-class Standing:
-    """A base that never moves."""
-
-    def __init__(self, world: World, pose: SE2) -> None:
-        self.world, self.pose = world, pose
-
-    def poses_at(self, times_s: Floats) -> Floats:
-        """See `PoseSource`; the two rolled distances are zero."""
-        return np.tile([self.pose.x_m, self.pose.y_m, self.pose.theta_rad, 0.0, 0.0], (len(times_s), 1))
-
-
 class Sight:
     """A range finder on a base.  `is_mirrored` turns it the wrong way round: proof that a check of its angles can fail."""
 

@@ -23,8 +23,9 @@ import numpy as np
 from hw.readings import LaserScan
 from hw.sim.catalogue import BASES, LIDARS, device_url
 from hw.sim.faults import FaultyDevice, Schedule
+from hw.sim.obedient import ObedientRobot
 from hw.sim.raycast import cast_all
-from hw.sim.sight import Sight, Standing
+from hw.sim.sight import Sight
 from hw.sim.sim_port import PtyServer
 from hw.sim.world import World
 from protocol.geometry import SE2
@@ -39,7 +40,7 @@ class SerialDevice:
 
     def __init__(self, name: str, link: Path, faults: str = "", seed: int = 0, wheels: object = None) -> None:
         self.name, self.link = name, link
-        sight = Sight(Standing(ROOM, POSE), noise_m=0.0, seed=seed)
+        sight = Sight(ObedientRobot(ROOM, POSE), noise_m=0.0, seed=seed)
         device = LIDARS[name][0](sight) if name in LIDARS else BASES[name].make(wheels or Bend(name))  # type: ignore[arg-type]
         self.faulty = FaultyDevice(device, Schedule.parse(faults), seed)
         self._server = PtyServer([(self.faulty, link)])

@@ -11,7 +11,8 @@ from hw import scip
 from hw.device import open_lidar
 from hw.readings import LaserScan
 from hw.sim.hokuyo_sim import HokuyoSim
-from hw.sim.sight import Sight, Standing
+from hw.sim.obedient import ObedientRobot
+from hw.sim.sight import Sight
 from tests.harness.serial_device import POSE, ROOM, SerialDevice, wall_errors_m
 from tests.harness.waiting import first_reading
 
@@ -41,7 +42,7 @@ class Host:
     """A host that asks a simulated Hokuyo, as fast as it likes."""
 
     def __init__(self, baud: int = 0) -> None:
-        self.sim = HokuyoSim(scip.URG_04LX, Sight(Standing(ROOM, POSE), noise_m=0.0), baud)
+        self.sim = HokuyoSim(scip.URG_04LX, Sight(ObedientRobot(ROOM, POSE), noise_m=0.0), baud)
         self.now_s = 10.0
 
     def ask(self, command: str) -> scip.Message:

@@ -10,15 +10,16 @@ import pytest
 from hw import rplidar_wire, scip, sick_lms, ydlidar_wire
 from hw.sim.catalogue import HOKUYOS
 from hw.sim.hokuyo_sim import HokuyoSim
+from hw.sim.obedient import ObedientRobot
 from hw.sim.rplidar_sim import RplidarSim
 from hw.sim.sick_sim import SickSim
-from hw.sim.sight import Sight, Standing
+from hw.sim.sight import Sight
 from hw.sim.ydlidar_sim import YdlidarSim
 from tests.harness.serial_device import POSE, ROOM
 
 
 def sight() -> Sight:
-    return Sight(Standing(ROOM, POSE), noise_m=0.0)
+    return Sight(ObedientRobot(ROOM, POSE), noise_m=0.0)
 
 
 def answer(device: object, request: bytes, seconds: float = 0.1) -> bytes:
@@ -69,7 +70,7 @@ def told(scanner: SickSim, payload: bytes) -> bytes:
 def test_a_sick_tells_what_it_is_and_how_it_is_set() -> None:
     scanner = SickSim(sight())
     assert told(scanner, sick_lms.TYPE)[1:11] == b"LMS291;S05"
-    assert told(scanner, sick_lms.ERRORS) == b"\xb2\x10", "none"
+    assert told(scanner, b"\x32") == b"\xb2\x10", "none"
     told(scanner, sick_lms.variant_request(100, 0.25))
     status = told(scanner, sick_lms.STATUS)
     assert struct.unpack_from("<HH", status, 107) == (100, 25)

@@ -12,9 +12,10 @@ import pytest
 from hw.device import open_lidar, open_wheels
 from hw.readings import LaserScan, Odometry
 from hw.sim.catalogue import BASES, LIDARS, device_url
+from hw.sim.obedient import ObedientRobot
 from hw.sim.raycast import cast_all
 from hw.sim.robot import SimulatedRobot
-from hw.sim.sight import Sight, Standing
+from hw.sim.sight import Sight
 from hw.sim.sim_port import PtyServer
 from hw.sim.world import World
 from protocol.geometry import SE2
@@ -50,7 +51,7 @@ def errors_m(scan: LaserScan, pose: SE2 = POSE, world: World = ROOM) -> np.ndarr
 @pytest.mark.parametrize("name", LIDARS)
 def test_a_driver_measures_the_room_a_simulated_lidar_stands_in(name: str, serve: Serve) -> None:
     make, _ = LIDARS[name]
-    path = serve(make(Sight(Standing(ROOM, POSE), noise_m=0.0)))
+    path = serve(make(Sight(ObedientRobot(ROOM, POSE), noise_m=0.0)))
     with open_lidar(device_url(name, path)) as device:
         scan = first_reading(device, lambda reading: isinstance(reading, LaserScan) and not reading.is_partial, 8.0)
     assert isinstance(scan, LaserScan)
@@ -61,7 +62,7 @@ def test_a_driver_measures_the_room_a_simulated_lidar_stands_in(name: str, serve
 
 
 def test_a_mirrored_lidar_does_not_fit_the_room(serve: Serve) -> None:
-    path = serve(LIDARS["ld06"][0](Sight(Standing(ROOM, POSE), noise_m=0.0, is_mirrored=True)))
+    path = serve(LIDARS["ld06"][0](Sight(ObedientRobot(ROOM, POSE), noise_m=0.0, is_mirrored=True)))
     with open_lidar(device_url("ld06", path)) as device:
         scan = first_reading(device, lambda reading: isinstance(reading, LaserScan), 5.0)
     assert isinstance(scan, LaserScan)

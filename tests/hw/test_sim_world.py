@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from hw.errors import DeviceConfigError
+from hw.sim.obedient import ObedientRobot
 from hw.sim.places import Clearance
 from hw.sim.raycast import cast, cast_all
 from hw.sim.robot import DriveOptions, SimulatedRobot
-from hw.sim.sight import Sight, Standing, Turntable
+from hw.sim.sight import Sight, Turntable
 from hw.sim.world import ROBOT_RADIUS_M, World, open_world
 from protocol.geometry import SE2
 from protocol.grid import FREE, OCCUPIED
@@ -82,7 +83,7 @@ def test_starts_are_some_way_apart() -> None:
 def test_a_world_file_says_walls_circles_and_starts() -> None:
     world = World.parse("0 0 4 0 # south\n4 0 4 4\n4 4 0 4\n0 4 0 0\ncircle 3 3 0.25\nstart 1 2 90\n", "room.txt")
     assert world.start_poses(1) == [SE2(1, 2, math.pi / 2)]
-    ranges_m = Sight(Standing(world, SE2(1, 2, 0)), noise_m=0).ranges_m(np.zeros(2), np.array([0.0, math.pi]), 0, 10)
+    ranges_m = Sight(ObedientRobot(world, SE2(1, 2, 0)), noise_m=0).ranges_m(np.zeros(2), np.array([0.0, math.pi]), 0, 10)
     assert ranges_m == pytest.approx([3.0, 1.0])
 
 
