@@ -34,7 +34,11 @@ def encode_value(packet: int, value: int) -> bytes:
 
 def encode_stream(values: Mapping[int, int]) -> bytes:
     """A stream frame with these packets, in their order."""
-    body = b"".join(bytes((packet,)) + encode_value(packet, value) for packet, value in values.items())
+    return framed(b"".join(bytes((packet,)) + encode_value(packet, value) for packet, value in values.items()))
+
+
+def framed(body: bytes) -> bytes:
+    """A stream frame around packets, each its id and its bytes."""
     frame = HEADER + bytes((len(body),)) + body
     return frame + bytes((-sum(frame) & 0xFF,))
 

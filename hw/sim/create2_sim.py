@@ -14,7 +14,8 @@ from hw import create2
 from hw.sim.bases_sim import Counting, Streaming
 
 OFF, PASSIVE, SAFE, FULL = range(4)
-_MODES = {create2.START: PASSIVE, create2.SAFE: SAFE, 132: FULL, 133: PASSIVE, 143: PASSIVE, 173: OFF}
+_MODES = {create2.START: PASSIVE, 130: SAFE, create2.SAFE: SAFE, 132: FULL, 143: PASSIVE, 173: OFF}
+_MODES |= dict.fromkeys((133, 134, 135, 136), PASSIVE)  # power off and the ways to clean
 _RESET, _QUERY, _QUERY_LIST, _SONG = 7, 142, 149, 140
 _LENGTHS = {129: 2, 137: 5, 138: 2, 139: 4, 141: 2, 142: 2, 144: 4, 145: 5, 146: 5, 150: 2, 162: 3, 163: 5, 164: 5, 165: 2}
 _LENGTHS |= {167: 16, 168: 4}  # of a command with its operands; those not here are one byte long
@@ -62,7 +63,8 @@ class Create2Sim(Streaming):
         if code in _MODES and self._mode in (OFF, PASSIVE):
             self._drive(0, 0, now_s)
         if code == create2.STREAM:
-            self._stream, self._is_streaming = [p for p in command[2:] if p in create2.SIZES], True
+            self._stream = [p for p in command[2:] if p in create2.SIZES or p in create2.GROUPS]
+            self._is_streaming = True
         elif code == create2.PAUSE_STREAM:
             self._is_streaming = command[1] == 1
         elif code in (_QUERY, _QUERY_LIST):
@@ -99,7 +101,8 @@ class Create2Sim(Streaming):
         self._said = [(due_s, text) for due_s, text in self._said if due_s > now_s]
         for time_s in self.times(now_s):
             if self._is_streaming and self._stream:
-                out += create2.encode_stream(self._values(time_s, self._stream))
+                packets = (bytes((p,)) for p in self._stream)
+                out += create2.framed(b"".join(p + self._answer(p, time_s) for p in packets))
         return bytes(out)
 
 

@@ -56,6 +56,14 @@ def test_a_create2_knows_the_length_of_commands_it_does_not_carry_out(robot: Cre
     assert answer(robot, ignored + bytes((142, 35))) == b"\x02"
 
 
+def test_a_create2_streams_packets_and_groups(robot: Create2Sim) -> None:
+    robot.emit(4.99)
+    robot.receive(bytes((148, 2, 43, 101)), 5.0)
+    frame = robot.emit(5.01)
+    assert len(frame) == 3 + 3 + 1 + GROUP_BYTES[101] and sum(frame) % 256 == 0
+    assert (frame[2], frame[5]) == (43, 101) and frame[3:5] == frame[6:8], "the group begins with the same counter"
+
+
 def test_a_create2_that_is_off_hears_only_start() -> None:
     assert answer(Create2Sim(Counting(Turned())), bytes((142, 35))) == b""
 
