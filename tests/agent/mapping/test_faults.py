@@ -225,7 +225,8 @@ def test_a_crowd_around_the_robot_ends_in_the_same_map_at_the_same_place(drive: 
     assert drive.error_m() < 0.06
 
 
-def test_a_robot_carried_to_an_unknown_place_begins_a_new_map(drive: Drive) -> None:
+@pytest.mark.parametrize("jump_m", [100.0, 0.0], ids=["the wheels jumped", "the wheels noticed nothing"])
+def test_a_robot_carried_to_an_unknown_place_begins_a_new_map(drive: Drive, jump_m: float) -> None:
     drive.steps(200)
     before = drive.mapper.estimate()
     elsewhere = np.array(
@@ -235,7 +236,8 @@ def test_a_robot_carried_to_an_unknown_place_begins_a_new_map(drive: Drive) -> N
     for k in range(int((NEW_MAP_AFTER_S + 12.0) * 5)):
         stamp_s = drive.now_s + 0.2 * k
         pose = SE2(0.3 * math.sin(0.1 * k), 0.0, 0.05 * k)
-        drive.mapper.add_odometry(Odometry(stamp_s, 100.0 + pose.x_m, pose.y_m, pose.theta_rad))
+        wheels = SE2(jump_m, 0.0, 0.0) @ drive.wheels.pose @ pose
+        drive.mapper.add_odometry(Odometry(stamp_s, wheels.x_m, wheels.y_m, wheels.theta_rad))
         outcomes.append(drive.mapper.add_scan(scan_at(elsewhere, pose, stamp_s, drive.rng)))
     after = drive.mapper.estimate()
     assert any("new local map" in o.reason for o in outcomes)
