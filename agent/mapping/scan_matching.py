@@ -50,7 +50,7 @@ def refine(
 ) -> Fit:
     """Gauss-Newton from (P, 3) poses, each held by its prior with information (P, 3, 3), in the fields of (P,) particles."""
     poses = poses.copy()
-    for _ in range(iterations):
+    for _ in range(iterations):  # no early end: on intel some particle still moves by 2 mm in 99 of 100 last steps
         _, pull, curvature = linearised(fields, particles, poses, surfels)
         pull = pull + np.einsum("pij,pj->pi", weights, difference(priors, poses))
         step = np.linalg.solve(curvature + weights, pull[:, :, None])[:, :, 0]

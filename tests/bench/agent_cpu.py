@@ -78,6 +78,7 @@ def watched(robot: str, pid: int, lidar: str, world: str, seconds: float) -> dic
         "bar": BAR_CPU,
         "mapping ms a scan": after["cpu_ms_per_scan"],
         "scans lost": int(str(after["scans_lost"])) - int(str(before["scans_lost"])),
+        "lost before": int(str(before["scans_lost"])),
         "RSS MB": round(resident_mb(pid), 1),
         "peak MB": round(peak_mb(pid), 1),
         "known m2": after.get("known_m2"),
