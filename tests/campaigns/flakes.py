@@ -1,10 +1,10 @@
 """C12, the flake hunt: the default tests again and again, in random order, with random inputs, beside a busy neighbour.
 
-    .venv/bin/python -m tests.campaigns.flakes [--rounds 50] [--hogs 0] [--seed 1] [--store FILE] [--json] [-- PYTEST ARGUMENTS]
+    .venv/bin/python -m tests.campaigns.flakes [--rounds 50] [--hogs 0] [--seed 1] [--kept FILE] [--json] [-- PYTEST ARGUMENTS]
 
 Every test that failed in any round is listed with how often and why; what fails always is broken, what fails sometimes is a
-flake, and both are our bugs.  `--hogs` processes do nothing but compute meanwhile.  With `--store` every round is a line that
-is appended to FILE when it ends: a hunt that was stopped goes on where it was, until there are as many rounds as asked for.
+flake, and both are our bugs.  `--hogs` processes do nothing but compute meanwhile.  With `--kept` every round is
+written down in FILE when it ends: a hunt that was stopped goes on where it was, until there are as many rounds as asked for.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from tests.bench.tables import markdown
+from tests.harness.kept import keep, kept
 
 ROOT = Path(__file__).resolve().parents[2]
 REASON_CHARS = 160
@@ -36,15 +37,17 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--rounds", type=int, default=50)
     parser.add_argument("--hogs", type=int, default=0)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--store", type=Path, help="where rounds are kept: the hunt may be stopped and gone on with")
+    parser.add_argument(
+        "--kept", type=Path, metavar="FILE", help="where rounds are written down: the hunt may be stopped and gone on with"
+    )
     parser.add_argument("--json", action="store_true")
     parser.add_argument("pytest", nargs="*", help="what to run instead of everything")
     args = parser.parse_args(argv)
-    rounds = stored(args.store)
+    rounds = [Round(**record) for record in kept(args.kept)]
     with busy(args.hogs):
         while len(rounds) < args.rounds:
             rounds.append(one_round(random.Random(f"{args.seed}/{len(rounds)}").randrange(2**31), args.pytest))
-            keep(args.store, rounds[-1])
+            keep(args.kept, asdict(rounds[-1]))
             print(f"round {len(rounds)}: {json.dumps(asdict(rounds[-1]))}", file=sys.stderr, flush=True)
     print(json.dumps([asdict(each) for each in rounds], indent=1) if args.json else table(rounds))
     return 1 if any(each.failed for each in rounds) else 0
@@ -59,20 +62,6 @@ class Round:
     load: float
     minutes: float
     failed: dict[str, str]  # by test: the first words of why
-
-
-def stored(store: Path | None) -> list[Round]:
-    """The rounds of earlier runs."""
-    if store is None or not store.is_file():
-        return []
-    return [Round(**json.loads(line)) for line in store.read_text().splitlines()]
-
-
-def keep(store: Path | None, done: Round) -> None:
-    if store is not None:
-        store.parent.mkdir(parents=True, exist_ok=True)
-        with store.open("a") as file:
-            file.write(json.dumps(asdict(done)) + "\n")
 
 
 def one_round(seed: int, words: list[str]) -> Round:
