@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from protocol.geometry import SE2
 from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
+_READ_BACK, _MOVED_WALLS = 0.5, 0.1  # share of the area at least, of the walls at most: the newest minutes may be lost
 _MAX_CELLS = 20_000  # of their map that are looked up; more does not change the third digit
 
 
@@ -42,6 +43,13 @@ def agreement(ours: OccupancyGrid, theirs: OccupancyGrid, T_ours_theirs: SE2) ->
     seen_b, against_b = _walls_against(ours, theirs, T_ours_theirs.inverse(), step_m)
     conflict = min(against_a + against_b, both)
     return Agreement(both - conflict, conflict, seen_a + seen_b, against_a + against_b)
+
+
+def is_same_drawing(earlier: OccupancyGrid, newer: OccupancyGrid) -> bool:
+    """Whether a map that was begun anew is the earlier one, read back from a disk; one of another place starts small."""
+    found = agreement(earlier, newer, SE2.identity())
+    is_whole = newer.known_area_m2() >= _READ_BACK * earlier.known_area_m2()
+    return is_whole and found.walls > 0 and found.wall_conflict_share <= _MOVED_WALLS
 
 
 def _walls_against(walls_of: OccupancyGrid, free_of: OccupancyGrid, T: SE2, step_m: float) -> tuple[int, int]:

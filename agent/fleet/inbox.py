@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from agent.fleet.composition import Composition
+from agent.fleet.consistency import is_same_drawing
 from agent.fleet.fetching import Fetching
 from agent.fleet.ledger import Ledger
 from agent.fleet.members import Peer, newer_statements
@@ -129,6 +130,8 @@ class Inbox:
         peer.maps.add(tiles, needed=peer.admitted.digest if peer.admitted is not None else b"")
         if peer.held is not None and peer.held.frame != said.map.frame:
             peer.anchor = None
+            if peer.grid is not None and not is_same_drawing(peer.grid, tiles.grid()):
+                self._pairs.words.forget_hint(peer.robot)
         is_newest = peer.held is None or peer.held.frame != said.map.frame or said.map.revision > peer.held.revision
         if is_newest:
             peer.hold(said.map, tiles.grid())

@@ -7,6 +7,7 @@ import random
 import struct
 
 from agent.fleet.composition import Composition
+from agent.fleet.consistency import is_same_drawing
 from agent.fleet.ledger import Ledger, statements_digest
 from agent.fleet.pairs import PairWork
 from agent.fleet.state import Presence
@@ -43,7 +44,7 @@ class OwnWords:
             return
         (grid, features, epoch), self._latest = self._latest, None
         own = self._ledger.own
-        before = own.version
+        before, drawn_before = own.version, own.grid
         if self.recalled_epoch not in (None, epoch):
             self._pairs.words.remembered, self.recalled_epoch = {}, None
         self.epoch = epoch
@@ -53,6 +54,8 @@ class OwnWords:
         assert own.version is not None and own.announcement is not None
         if before is not None and before.frame != own.version.frame:
             self._pairs.on_new_frame(self._ledger.robot, now_s)
+            if drawn_before is not None and own.grid is not None and not is_same_drawing(drawn_before, own.grid):
+                self._pairs.words.forget_hints()
         is_new_frame = before is None or before.frame != own.version.frame
         if is_new_frame or own.known_area_m2 > self._announced_m2 * (1.0 + self._ledger.options.announce_growth):
             self._announced_m2 = own.known_area_m2

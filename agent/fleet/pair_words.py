@@ -32,6 +32,11 @@ class PairWords:
         self.pair(peer).hint = None
         self.remembered.pop(peer, None)
 
+    def forget_hints(self) -> None:
+        """Our own map was begun in another place."""
+        for pair in self.pairs.values():
+            pair.hint = None
+
     def say(self, other: str, stance: Stance, evidence: Evidence, holds: bytes, reason: str) -> None:
         """Change our statement about a pair, and publish it."""
         ledger = self._ledger

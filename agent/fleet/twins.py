@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from agent.fleet.ledger import Ledger
 from protocol.messages import Beat, Message
 
+_GONE_AFTER_BEATS = 3.0
+
 
 @dataclass(slots=True)
 class _Twin:
@@ -16,6 +18,7 @@ class _Twin:
     seq: int = 0
     beats: int = 0
     heard_s: float = -1e9
+    period_s: float = 1.0
 
 
 class TwinWatch:
@@ -35,7 +38,7 @@ class TwinWatch:
         twin = self._twin
         if message.seq <= twin.seq or now_s - twin.heard_s < 0.5 * message.period_s:
             return  # late beats of our own former life come in bursts
-        twin.seq, twin.beats, twin.heard_s = message.seq, twin.beats + 1, now_s
+        twin.seq, twin.beats, twin.heard_s, twin.period_s = message.seq, twin.beats + 1, now_s, message.period_s
         if twin.beats < 2:
             return
         is_younger = (self._ledger.clock.now_s, -self._ledger.boot) < (message.uptime_s, -message.boot)
@@ -46,6 +49,6 @@ class TwinWatch:
             )
 
     def check(self, now_s: float) -> None:
-        """Speak again when the other has been silent for long."""
-        if self.is_twin and self._twin is not None and now_s - self._twin.heard_s > self._ledger.options.lost_after_s:
+        """Speak again when the other has missed some beats: at its next two we fall silent once more."""
+        if self.is_twin and self._twin is not None and now_s - self._twin.heard_s > _GONE_AFTER_BEATS * self._twin.period_s:
             self.is_twin, self._twin = False, None

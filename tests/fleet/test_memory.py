@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 
 import pytest
 
 from agent.fleet.effects import Match, MatchKind
 from agent.fleet.memory import FleetMemory, decode_memory
-from agent.merging.result import MergeResult
+from agent.merging.result import MatchStatus, MergeResult
 from protocol.geometry import SE2
 from tests.fleet.explorer import Explorer, random_world
 from tests.fleet.simulation import Fleet, Node, truthful
@@ -65,6 +66,30 @@ def test_what_is_remembered_of_another_map_is_not_tried() -> None:
     fleet.start(node, memory)
     fleet.run_until(lambda: fleet.agrees(NAMES), 20.0)
     assert node.coordinator.memory().epoch == 2
+    held = fleet.nodes["r0"].global_map
+    assert held is not None
+    place = next(member for member in held.members if member.robot == "r2").T_global_map
+    assert place.distance_m(fleet.true_T("r0", "r2")) < 1e-5
+
+
+def test_a_peer_that_began_anew_elsewhere_is_searched_for_though_its_old_place_would_be_believed() -> None:
+    fleet, searches = merged_fleet()
+    searches.clear()
+    judge = fleet.judge
+
+    def credulous(fleet: Fleet, node: Node, job: Match) -> MergeResult:
+        result = judge(fleet, node, job)
+        return result if job.kind is not MatchKind.VERIFY else replace(result, status=MatchStatus.MERGED)
+
+    fleet.judge = credulous
+    node = fleet.nodes["r2"]
+    fleet.crash(node)
+    assert node.explorer is not None
+    node.explorer = Explorer.at(node.explorer.world, SE2(6, -6, 1.0), 2.0)
+    node.explorer.look(node.explorer.T_world_robot, 12.0)
+    fleet.start(node)
+    fleet.run_until(lambda: fleet.agrees(NAMES), 20.0)
+    assert [job for job in searches if job.peer == "r2"]
     held = fleet.nodes["r0"].global_map
     assert held is not None
     place = next(member for member in held.members if member.robot == "r2").T_global_map
