@@ -145,9 +145,10 @@ class TiledFields:
     def _unused_tiles(self, n: int) -> Ints:
         unused = np.flatnonzero(self.owners[1:] == 0) + 1
         if len(unused) < n:
-            grown = max(2 * len(self.pool), len(self.pool) + n)
-            self.pool = np.vstack([self.pool, np.zeros((grown - len(self.pool), AREA), np.uint8)])
-            self.owners = np.append(self.owners, np.zeros(grown - len(self.owners), np.int64))
+            grown = np.zeros((max(3 * len(self.pool) // 2, len(self.pool) + n), AREA), np.uint8)  # no memory until written
+            grown[: len(self.pool)] = self.pool
+            self.owners = np.append(self.owners, np.zeros(len(grown) - len(self.pool), np.int64))
+            self.pool = grown
             unused = np.flatnonzero(self.owners[1:] == 0) + 1
         return unused[:n]
 
