@@ -96,9 +96,9 @@ class LoopCloser:
         since_m = np.minimum(way[here] - way[old], way[here] - way[min(self.known, here)])
         reach_m = np.minimum(REACH_M + REACH_A_METRE * since_m, LARGEST_REACH_M)
         away_m = np.hypot(*(line[old, :2] - line[here, :2]).T)
-        old = old[np.argsort(np.where(away_m <= reach_m, away_m, np.inf), kind="stable")][: np.count_nonzero(away_m <= reach_m)]
+        near = np.flatnonzero(away_m <= reach_m)
         places: list[int] = []
-        for k in old.tolist():
+        for k in old[near[np.argsort(away_m[near], kind="stable")]].tolist():
             if len(places) > self.misses % 4:
                 break
             if all(abs(way[k] - way[p]) > SHORTEST_LOOP_M / 2 for p in places):
