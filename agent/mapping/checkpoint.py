@@ -171,8 +171,7 @@ def numbered_anew(tables: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray
 
 
 def drawing_state(drawing: Drawing) -> State:
-    kept = drawing.kept()
-    scans = [scan for scan in drawing.scans if scan is not None]
+    scans = list(drawing.scans.values())
     return {
         **grid_state("grid", drawing.grid),
         **grid_state("base", drawing.base),
@@ -182,7 +181,7 @@ def drawing_state(drawing: Drawing) -> State:
         "drawn.oldest": drawing.oldest,
         "drawn.redrawn": drawing.redrawn,
         "drawn.thin_at": drawing.thin_at,
-        "drawn.kept": np.array(kept, np.int64),
+        "drawn.kept": np.array(list(drawing.scans), np.int64),
         "drawn.sizes": np.array([len(s.ends) for s in scans], np.int64),
         "drawn.ends": np.vstack([np.empty((0, 2), np.int16), *(s.ends for s in scans)]),
         "drawn.unit_m": np.array([s.unit_m for s in scans]),
@@ -266,7 +265,7 @@ def put_drawing(drawing: Drawing, state: State) -> None:
     put_grid(drawing.base, "base", state)
     drawing.coarse.empty, drawing.coarse.first = state["coarse.empty"], state["coarse.first"]
     drawing.poses, drawing.oldest, drawing.redrawn = state["drawn.poses"], state["drawn.oldest"], state["drawn.redrawn"]
-    drawing.thin_at, drawing.scans = state["drawn.thin_at"], [None] * len(drawing.poses)
+    drawing.thin_at = state["drawn.thin_at"]
     put_kept(drawing, state)
     if state["fresh.poses"] >= 0:
         drawing.resume(state["fresh.target"], state["fresh.poses"], state["fresh.is_bent"])

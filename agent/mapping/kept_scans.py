@@ -8,7 +8,6 @@ are enough to make a cell free or occupied.  So what is kept grows with the grou
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,15 +55,13 @@ class KeptScan:
         return self.ends.nbytes + self.hit_bits.nbytes
 
 
-def needless(poses: Poses, kept: Iterable[int]) -> list[int]:
-    """Which of the kept keyframes, in order of time, drawing can do without; `poses` (K, 3) are those of all keyframes."""
-    numbers = np.fromiter(kept, np.int64)
-    numbers = numbers[numbers < len(poses) - NEVER_THINNED]
-    x, y, theta = poses[numbers].T
+def needless(poses: Poses) -> NDArray[np.bool_]:
+    """Which of (K, 3) keyframes, in order of time, drawing can do without."""
+    x, y, theta = poses.T
     places = np.stack([np.floor(x / PLACE_M), np.floor(y / PLACE_M), np.round(theta * (DIRECTIONS / math.tau)) % DIRECTIONS])
     _, place, visits = np.unique(places, axis=1, return_inverse=True, return_counts=True)
     place = place.ravel()
     order = np.argsort(place, kind="stable")
-    nth = np.empty(len(numbers), np.int64)  # visit to its place
-    nth[order] = np.arange(len(numbers)) - np.repeat(np.cumsum(visits) - visits, visits)
-    return [int(k) for k in numbers[(nth > 0) & (nth < visits[place] - LAST_KEPT)]]
+    nth = np.empty(len(poses), np.int64)  # visit to its place
+    nth[order] = np.arange(len(poses)) - np.repeat(np.cumsum(visits) - visits, visits)
+    return np.asarray((nth > 0) & (nth < visits[place] - LAST_KEPT))

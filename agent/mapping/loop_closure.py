@@ -70,7 +70,7 @@ class LoopCloser:
         self.next_look = len(line) + SHORT_PAUSE
         way = way_m(line)
         local = recent(way)
-        old = self._candidate(line, way, local, np.array(drawing.kept(), np.int64) + drawing.oldest)
+        old = self._candidate(line, way, local, np.array(list(drawing.scans)))
         if old is None:
             return None
         given = around(old, way, drawing.oldest, local.start)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.mapping.correlation import CoarseField
-from agent.mapping.kept_scans import FEWEST_TO_THIN, THIN_AGAIN, KeptScan, needless
+from agent.mapping.kept_scans import FEWEST_TO_THIN, NEVER_THINNED, THIN_AGAIN, KeptScan, needless
 from agent.mapping.likelihood import TiledFields
 from agent.mapping.log_odds import LogOddsGrid
 from agent.mapping.options import MappingOptions
@@ -29,15 +29,15 @@ KEPT_BYTES = 16_000_000  # of scans: 10,000 places at 360 beams; beyond, the old
 
 
 class Drawing:
-    """Grid and coarse field of the drawn path; `poses[k]` is where keyframe k was drawn from."""
+    """Grid and coarse field of the drawn path; `poses[k]` is where keyframe oldest + k was drawn from."""
 
     def __init__(self, options: MappingOptions) -> None:
         self.options = options
         self.grid = new_grid(options)
         self.coarse = CoarseField()
-        self.scans: list[KeptScan | None] = []  # None: its place is seen by others
+        self.scans: dict[int, KeptScan] = {}  # by keyframe, in order
         self.poses: Poses = np.empty((0, 3))
-        self.oldest = 0  # keyframe number of scans[0]
+        self.oldest = 0  # keyframe that can be drawn again
         self.thin_at = FEWEST_TO_THIN  # scans kept
         self.base = new_grid(options)  # keyframes before `oldest`, drawn for good
         self.fresh: Drawing | None = None  # a drawing in progress, of the first len(fresh.poses) keyframes
@@ -53,16 +53,8 @@ class Drawing:
     def add(self, points: ScanPoints, pose: NDArray[np.float64]) -> None:
         """A new keyframe."""
         scan = KeptScan.of(points)
-        self.scans.append(scan)
+        self.scans[self.oldest + len(self.poses)] = scan
         self._draw(scan, pose)
-
-    def scan_of(self, keyframe: int) -> KeptScan | None:
-        """What was seen from a keyframe, where it is kept."""
-        return self.scans[keyframe - self.oldest] if keyframe >= self.oldest else None
-
-    def kept(self) -> list[int]:
-        """Numbers, counted from the oldest, of the keyframes whose scans are kept."""
-        return [k for k, scan in enumerate(self.scans) if scan is not None]
 
     def _draw(self, scan: KeptScan | None, pose: NDArray[np.float64]) -> None:
         self.poses = np.vstack([self.poses, pose])
@@ -101,7 +93,7 @@ class Drawing:
             self.fresh.field = TiledFields(1, self.options.resolution_m, FIELD_SIGMA_M)
             stamp_all(self.fresh.field, self._base_points_m())
         for k in range(done):
-            self.fresh._draw(self.scans[k], target[k])
+            self.fresh._draw(self.scans.get(self.oldest + k), target[k])
 
     def _blank(self) -> Drawing:
         fresh = Drawing(self.options)
@@ -122,7 +114,7 @@ class Drawing:
         self.target = np.vstack([self.target, added])
         most = SCANS_A_CALL if fresh.field is None else BENT_SCANS_A_CALL
         for k in range(done, min(done + most, len(path))):
-            fresh._draw(self.scans[k], self.target[k])
+            fresh._draw(self.scans.get(self.oldest + k), self.target[k])
         if len(fresh.poses) < len(path):
             return None
         self.grid.replace_by(fresh.grid)
@@ -133,25 +125,24 @@ class Drawing:
 
     def _forget(self) -> None:
         """A few scans a place are kept; where that is more than KEPT_BYTES, the older half becomes part of the base."""
-        kept = self.kept()
-        if len(kept) < self.thin_at:
+        if len(self.scans) < self.thin_at:
             return
-        for k in needless(self.poses, kept):
-            self.scans[k] = None
-        if sum(scan.nbytes for scan in self.scans if scan is not None) > KEPT_BYTES:
+        kept = np.array(list(self.scans))
+        kept = kept[kept < self.oldest + len(self.poses) - NEVER_THINNED]
+        for k in kept[needless(self.poses[kept - self.oldest])].tolist():
+            del self.scans[k]
+        if sum(scan.nbytes for scan in self.scans.values()) > KEPT_BYTES:
             self._draw_for_good()
-        self.thin_at = max(FEWEST_TO_THIN, int(THIN_AGAIN * len(self.kept())))
+        self.thin_at = max(FEWEST_TO_THIN, int(THIN_AGAIN * len(self.scans)))
 
     def _draw_for_good(self) -> None:
         """The older half of what is kept becomes part of the base."""
-        kept = self.kept()
-        half = kept[len(kept) // 2]
-        for scan, pose in zip(self.scans[:half], self.poses[:half], strict=True):
-            if scan is not None:
-                draw(self.base, self.options, scan, pose)
-        del self.scans[:half]
-        self.poses = self.poses[half:]
-        self.oldest += half
+        kept = list(self.scans)
+        half = len(kept) // 2
+        for k in kept[:half]:
+            draw(self.base, self.options, self.scans.pop(k), self.poses[k - self.oldest])
+        self.poses = self.poses[kept[half] - self.oldest :]
+        self.oldest = kept[half]
 
 
 def stamp_surface(field: TiledFields, options: MappingOptions, scan: KeptScan, pose: NDArray[np.float64]) -> None:

@@ -49,7 +49,7 @@ def grid_of(drawing: Drawing, keyframes: range, line: Poses) -> OccupancyGrid:
     """A stretch alone, drawn in the map frame."""
     grid = new_grid(drawing.options)
     for k in keyframes:
-        if (scan := drawing.scan_of(k)) is not None:
+        if (scan := drawing.scans.get(k)) is not None:
             draw(grid, drawing.options, scan, line[k])
     return grid.trinary()
 
@@ -58,7 +58,7 @@ def points_of(drawing: Drawing, keyframes: range, line: Poses) -> NDArray[np.flo
     """(N, 2) some of what a stretch saw, map frame."""
     points = [np.empty((0, 2))]
     for k in keyframes:
-        if (scan := drawing.scan_of(k)) is None:
+        if (scan := drawing.scans.get(k)) is None:
             continue
         hits = scan.points_m[scan.is_hit]
         hits = hits[np.hypot(hits[:, 0], hits[:, 1]) < RANGE_M]
