@@ -30,7 +30,8 @@ OURS = {
     "paper": "agent.merging.adapter:merge_like_the_paper",
     "paper-guarded": "agent.merging.adapter:merge_guarded",
 }
-KIT = ("seed", "seed-guarded", "fft", "arw", "fmt")
+KIT = ("seed", "seed-guarded", "fft", "fmt")
+SLOW = ("arw",)  # a random walk of up to four minutes a pair: only when asked for by name
 SETS = ("main", "res20", "degraded")
 BESIDE_STRIDE = 6  # an exhaustive search takes seconds a pair
 
@@ -64,7 +65,7 @@ def main() -> None:
 def _arguments() -> argparse.Namespace:
     default = os.environ.get("BENCH_DATA", str(Path.home() / ".cache/mapquilt-bench/data"))
     parser = argparse.ArgumentParser(prog="tests.bench.merge", description=__doc__.splitlines()[0])  # type: ignore[union-attr]
-    parser.add_argument("--adapters", nargs="+", default=["mapquilt"], choices=[*OURS, *KIT])
+    parser.add_argument("--adapters", nargs="+", default=["mapquilt"], choices=[*OURS, *KIT, *SLOW])
     parser.add_argument("--beside", action="store_true", help="every method there is, ours and the kit's, on the same pairs")
     parser.add_argument("--seeds", nargs="+", default=["2024"], help="fills {seed} in --data")
     parser.add_argument("--data", default=default, help="where the sets lie (default: BENCH_DATA)")

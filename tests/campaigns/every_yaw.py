@@ -47,10 +47,10 @@ def turned_pairs(step_deg: int, resolution_m: float, seed: int) -> Iterator[MapP
     rng = np.random.default_rng(seed)
     plan = office(seed)
     T_a = SE2(3.0, -2.0, 0.3)
-    ours = plan.mapped(T_a, resolution_m, (-1.0, 0.7 * plan.width_m), noise_m=0.02, seed=1)
+    ours = plan.mapped(T_a, resolution_m, (-1.0, 0.7 * plan.width_m), noise_m=0.02, seed=1, hit=True)
     for yaw_deg in range(0, 360, step_deg):
         T_b = SE2(*rng.uniform(-50, 50, 2), math.radians(yaw_deg))
-        theirs = plan.mapped(T_b, resolution_m, (0.3 * plan.width_m, 1e3), noise_m=0.02, seed=1000 + yaw_deg)
+        theirs = plan.mapped(T_b, resolution_m, (0.3 * plan.width_m, 1e3), noise_m=0.02, seed=1000 + yaw_deg, hit=True)
         truth = T_a @ T_b.inverse()
         yield MapPair(f"{yaw_deg} deg", ours, theirs, truth, overlap_middle(ours, theirs, truth))
 

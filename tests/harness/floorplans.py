@@ -31,8 +31,12 @@ class FloorPlan:
         x_range_m: tuple[float, float] = (-1.0, 1e3),
         noise_m: float = 0.0,
         seed: int = 0,
+        hit: bool = False,
     ) -> OccupancyGrid:
-        """The map of everything between two x of the world, in a frame of one's own; its origin is its lower-left corner."""
+        """The map of everything between two x of the world, in a frame of one's own; its origin is its lower-left corner.
+
+        Walls are lines of pixels, which lie up to a third of a cell beside the true ones; or where beams would `hit` them.
+        """
         low, high = max(-0.2, x_range_m[0]), min(self.width_m + 0.2, x_range_m[1])
         area = np.array([[low, -0.2], [high, -0.2], [high, self.height_m + 0.2], [low, self.height_m + 0.2]])
         inside = np.array([[low, 0], [high, 0], [high, self.height_m], [low, self.height_m]]).clip(
@@ -57,8 +61,31 @@ class FloorPlan:
             rim = np.column_stack([x + radius * np.cos(turns), y + radius * np.sin(turns)])
             cv2.fillPoly(grid.view(np.uint8), [cells(rim)], 255, shift=_SHIFT)
             cv2.polylines(wall, [cells(rim)], True, 1, 1, shift=_SHIFT)
-        grid[(_scattered(wall, noise_m / resolution_m, seed) & seen) > 0] = OCCUPIED
+        if hit:
+            surface = T_map_world.apply(self._surface(resolution_m / 2))
+            surface += np.random.default_rng(seed).normal(0, noise_m, surface.shape)
+            wall = _hit((surface - corner) / resolution_m, wall.shape)
+        else:
+            wall = _scattered(wall, noise_m / resolution_m, seed)
+        grid[(wall & seen) > 0] = OCCUPIED
         return OccupancyGrid(grid, resolution_m, SE2(float(corner[0]), float(corner[1]), 0.0))
+
+    def _surface(self, spacing_m: float) -> NDArray[np.float64]:
+        """(N, 2) points along all walls and around all pillars, world frame: what beams hit."""
+        ends = [(w[:2], w[2:]) for w in self.walls]
+        turns = [np.arange(0, 2 * np.pi, spacing_m / radius) for _, _, radius in self.pillars]
+        rims = [p[:2] + p[2] * np.stack([np.cos(t), np.sin(t)], axis=1) for p, t in zip(self.pillars, turns, strict=True)]
+        straight = [a + np.arange(0, 1, spacing_m / max(spacing_m, np.hypot(*(b - a))))[:, None] * (b - a) for a, b in ends]
+        return np.concatenate([*straight, *rims])
+
+
+def _hit(cells_xy: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """1 where a point falls into the cell."""
+    col, row = np.floor(cells_xy).astype(int).T
+    inside = (row >= 0) & (col >= 0) & (row < shape[0]) & (col < shape[1])
+    image = np.zeros(shape, np.uint8)
+    image[row[inside], col[inside]] = 1
+    return image
 
 
 def _scattered(wall: NDArray[np.uint8], sigma_cells: float, seed: int) -> NDArray[np.uint8]:
