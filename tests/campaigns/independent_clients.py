@@ -6,8 +6,9 @@
     .venv/bin/python -m tests.campaigns.independent_clients --python /tmp/clients/bin/python
 
 LIDARs: each client decodes the devices it knows in a known room; the median difference from the walls must be below a
-centimetre, and the same device, mirrored, must not fit.  Bases: the robot explores; the way of each wheel that a client reads
-must follow the way it went, to a centimetre, and not that of the other wheel.  A client that is not installed is left out.
+centimetre, and the same device, mirrored, must not fit.  Bases: the robot explores, or drives as the client tells it; the way of
+each wheel that a client reads must follow the way it went, to a centimetre, and not that of the other wheel.  A client that is
+not installed is left out.
 """
 
 from __future__ import annotations
@@ -24,26 +25,20 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
 from hw.sim.catalogue import BASES
-from hw.sim.raycast import cast_all
-from hw.sim.robot import SimulatedRobot
-from hw.sim.world import open_world
-from tests.bench.tables import next_line
+from tests.bench.tables import line, markdown
+from tests.harness.client_truth import DRIVE, ROBOT_SEED, Rows, driven_errors_m, wall_errors_m, way_errors_m
 from tests.harness.serial_device import POSE, ROOM
 from tests.harness.waiting import until
 
 WANTED_M = 0.01
 SECONDS = 25.0
-Rows = list[list[float]]  # of a LIDAR [degrees counter-clockwise, metres], of a base [seconds, left ticks, right ticks]
 FOREIGN = Path(__file__).parents[1] / "harness" / "foreign_clients.py"
-ROBOT_SEED = 3
-BEGUN_BEFORE_S = 12.0  # a client has begun to read so long after the robot was started
-
 # Not here: lds2d reads an LDS-01 one degree off the maker's own ROS driver, which we follow; adafruit's express scan sends a
 # request without its operands, which no RPLIDAR understands; pyrplidar reads dense capsules with their bytes swapped;
 # hokuyolx counts the angles of a URG from step 0.
@@ -79,6 +74,9 @@ CASES = [  # (client, device, what the client is told, baud it is told)
     ("yarc", "create2", "-", 0),
     ("create-serial", "create2", "-", 0),
     ("basicmicro", "roboclaw", "-", 0),
+    ("pycreate2", "create2", DRIVE, 0),
+    ("yarc", "create2", DRIVE, 0),
+    ("basicmicro", "roboclaw", DRIVE, 0),
     ("kobukidriver", "kobuki", "-", 0),
 ]
 MODULES = {"rplidar-roboticia": "rplidar", "adafruit-rplidar": "adafruit_rplidar", "pylidar3": "PyLidar3"}
@@ -131,8 +129,9 @@ def main() -> int:
     for case in CASES:
         if args.only in ("", *case):
             rows.append(judged(args.python, *case))
+            row = figures(rows[-1])
             if not args.json:
-                print(next_line(figures(rows[-1]), is_first=len(rows) == 1), flush=True)
+                print(markdown([row]) if len(rows) == 1 else line(row, list(row)), flush=True)
     if args.json:
         print(json.dumps([asdict(row) for row in rows], indent=2))
     return int(any(row.verdict.startswith("WRONG") for row in rows))
@@ -145,7 +144,9 @@ def judged(python: str, client: str, device: str, mode: str, baud: int) -> Row:
     if missing:
         row.verdict = f"skipped: {missing}"
         return row
-    if device in BASES:
+    if device in BASES and mode == DRIVE:
+        errors, control = driven_errors_m(device, measured(python, client, device, mode, baud, []))
+    elif device in BASES:
         read = measured(python, client, device, mode, baud, ["--explore", "--seed", str(ROBOT_SEED)])
         errors, control = way_errors_m(device, read)
     else:
@@ -231,44 +232,6 @@ def scan_of(device: str, values: list[float]) -> Rows:
     n = len(values) // 2
     beams = zip(np.linspace(*FIELDS_DEG[device], n).tolist(), values[:n], values[n:], strict=True)
     return [[degrees, metres] for degrees, metres, is_valid in beams if is_valid]
-
-
-def wall_errors_m(beams: Rows) -> np.ndarray:
-    """How far each range is from the wall at its bearing."""
-    seen = np.array([beam for beam in beams if 0.05 < beam[1] < 20.0]).reshape(-1, 2)
-    bearings = POSE.theta_rad + np.radians(seen[:, 0])
-    origins = np.tile([POSE.x_m, POSE.y_m], (len(seen), 1))
-    return np.abs(cast_all(ROOM.segments, origins, bearings, 100.0) - seen[:, 1])
-
-
-def way_errors_m(device: str, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
-    """How far the ways of both wheels are from the ways they went, and how far when left is taken for right.
-
-    The robot goes the same way for the same seed, so it is driven once more here; when the client began to read is not known
-    and found as the moment at which the readings fit best.
-    """
-    if len(rows) < 10:
-        return np.empty(0), np.empty(0)
-    drive, world = BASES[device].drive, open_world("office")
-    robot = SimulatedRobot(world, world.start_poses(1, ROBOT_SEED)[0], ROBOT_SEED, replace(drive))
-    robot.begin()
-    step_s = 0.005
-    clock_s = np.arange(0.0, 45.0, step_s)
-    robot.poses_at(clock_s[:1])
-    went_m = robot.poses_at(clock_s)[:, 3:5]
-    read = np.array(rows)
-    bits = 16 if device in ("create2", "kobuki") else 32
-    ticks = np.cumsum((np.diff(read[:, 1:], axis=0) + 2 ** (bits - 1)) % 2**bits - 2 ** (bits - 1), axis=0)
-    read_m = ticks * math.tau * drive.wheel_radius_m / drive.ticks_per_revolution
-    later = np.round((read[1:, 0] - read[0, 0]) / step_s).astype(int)
-    begins = np.arange(round(BEGUN_BEFORE_S / step_s))
-
-    def best(ways_m: np.ndarray) -> np.ndarray:
-        true_m = ways_m[begins[:, None] + later] - ways_m[begins, None]
-        errors = np.abs(true_m - read_m)
-        return errors[np.argmin(np.median(errors, axis=(1, 2)))].ravel()
-
-    return best(went_m), best(went_m[:, ::-1])
 
 
 def figures(row: Row) -> dict[str, object]:

@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from hw.driver import Driver
-from tests.bench.tables import next_line
+from tests.bench.tables import line, markdown
 from tests.harness.bad_line import KINDS, damaged
 from tests.harness.lidar_streams import STREAMS, Stream, decode, errors_m
 
@@ -65,8 +65,9 @@ def main() -> int:
     tallies: list[Tally] = []
     for name in names:
         tallies.append(torture(name, args.hours, args.share, args.seed, args.kind))
+        row = figures(tallies[-1])
         if not args.json:
-            print(next_line(figures(tallies[-1]), is_first=len(tallies) == 1), flush=True)
+            print(markdown([row]) if len(tallies) == 1 else line(row, list(row)), flush=True)
     if args.json:
         print(json.dumps([asdict(tally) for tally in tallies], indent=2))
     return int(any(tally.wrong_scans for tally in tallies if tally.has_checksum))

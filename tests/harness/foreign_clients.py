@@ -171,6 +171,8 @@ def pycreate2(port: str, mode: str, baud: int) -> Rows:
     robot = Create2(port)
     robot.start()
     robot.safe()
+    if mode == "drive":
+        robot.drive_direct(150, 100)  # right, left, mm/s
 
     def read() -> list[float]:
         sensors = robot.get_sensors()
@@ -187,6 +189,8 @@ def yarc(port: str, mode: str, baud: int) -> Rows:
     robot = Roomba(port)
     robot.start()
     robot.safe()
+    if mode == "drive":
+        robot.drive_direct(150, 100)  # right, left, mm/s
     wanted = [Sensor.LEFT_ENCODER_COUNTS, Sensor.RIGHT_ENCODER_COUNTS]
     return ticks(lambda: [count % 65536 for count in robot.query_list(*wanted)])
 
@@ -227,7 +231,9 @@ def basicmicro(port: str, mode: str, baud: int) -> Rows:
     assert board.Open(), "the port does not open"
     assert board.ReadVersion(0x80)[0], "no version"
     assert board.ReadMainBatteryVoltage(0x80) == (True, 124), "no voltage"
-    assert board.SpeedM1M2(0x80, 100, -100), "no answer to a speed"
+    ticks_per_m = 2048 / (math.tau * 0.05)
+    speeds_mps = (0.10, 0.15) if mode == "drive" else (0.01, -0.01)
+    assert board.SpeedM1M2(0x80, *(round(v * ticks_per_m) for v in speeds_mps)), "no answer to a speed"
 
     def read() -> list[float]:
         is_read, left, right = board.GetEncoders(0x80)
