@@ -47,6 +47,7 @@ case $robot in *[!a-z0-9_-]* | [_-]*) stop 2 "--robot '$robot': use a-z, 0-9, '-
 
 home=$root/opt/mapquilt
 settings=$root/etc/mapquilt
+group=mapquilt-keys
 command=$root/usr/local/bin/mapquilt
 unit=$root/etc/systemd/system/mapquilt@.service
 rules=$root/etc/udev/rules.d/90-mapquilt.rules
@@ -103,17 +104,23 @@ place_packages() {
     chmod -R go+rX "$home"
 }
 
+# Who may read the keys.  Not named mapquilt: systemd names the service's own user so, and will not make it beside such a group.
+make_group() {
+    getent group "$group" >/dev/null || groupadd --system "$group"
+    ! getent group mapquilt >/dev/null || getent passwd mapquilt >/dev/null || groupdel mapquilt
+}
+
 place_settings() {
     mkdir -p "$settings/fleet"
     place 644 "$here/robot.toml" "$settings/robot.toml.sample"
     [ -f "$settings/robot.toml" ] || place 644 "$here/robot.toml" "$settings/robot.toml"
-    [ -n "$root" ] || getent group mapquilt >/dev/null || groupadd --system mapquilt
+    [ -n "$root" ] || make_group
     if [ -n "$keys" ]; then
         for file in "$keys"/*; do
             place 640 "$file" "$settings/fleet/${file##*/}"
         done
     fi
-    [ -n "$root" ] || chgrp -R mapquilt "$settings/fleet"
+    [ -n "$root" ] || chgrp -R "$group" "$settings/fleet"
     chmod 750 "$settings/fleet"
 }
 
@@ -160,7 +167,7 @@ uninstall() {
     ! systemd_runs || systemctl daemon-reload
     if [ "$purge" = yes ]; then
         rm -rf "$settings" "$root/var/lib/mapquilt" "$root/var/lib/private/mapquilt"
-        [ -n "$root" ] || ! getent group mapquilt >/dev/null || groupdel mapquilt
+        [ -n "$root" ] || ! getent group "$group" >/dev/null || groupdel "$group"
         say "gone, settings and maps too"
     else
         say "gone; settings in /etc/mapquilt and maps in /var/lib/mapquilt are kept (--purge removes them)"

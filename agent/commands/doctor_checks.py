@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from agent.config import Config, control_socket, state_dir
+from agent.running import running_robots
 from agent.runtime.control import ControlError, ask
 
 PACKAGES = {
@@ -183,7 +184,7 @@ def port_thieves(machine: Machine) -> Iterator[Finding]:
 
 def view(machine: Machine) -> Iterator[Finding]:
     settings = machine.config.view
-    if not settings.enabled or settings.port == 0 or control_socket(machine.config.robot.id, machine.environ).exists():
+    if not settings.enabled or settings.port == 0 or _socket_of(machine).exists():
         return  # no page, any port, or our own robot has it
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -240,7 +241,7 @@ def security(machine: Machine) -> Iterator[Finding]:
 
 def running_robot(machine: Machine) -> Iterator[Finding]:
     robot = machine.config.robot.id
-    path = control_socket(robot, machine.environ)
+    path = _socket_of(machine)
     if not path.exists():
         return
     try:
@@ -254,6 +255,12 @@ def running_robot(machine: Machine) -> Iterator[Finding]:
         yield Finding(Level.WARN, "robot", f"{robot}: {problem}", f"mapquilt status --robot {robot}")
     if not status.get("problems"):
         yield ok("robot", f"{robot} runs, and has nothing to complain about")
+
+
+def _socket_of(machine: Machine) -> Path:
+    """Of the running robot, also when it is a service; else where one of this user would be."""
+    robot = machine.config.robot.id
+    return running_robots(machine.environ).get(robot) or control_socket(robot, machine.environ)
 
 
 CHECKS: tuple[Check, ...] = (

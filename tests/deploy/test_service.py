@@ -53,6 +53,13 @@ def test_the_service_is_hardly_exposed() -> None:
     assert done.returncode == 0
 
 
+def test_no_group_has_the_name_of_the_services_own_user() -> None:
+    """systemd names a template's dynamic user after what stands before the @, and fails with 217/USER beside such a group."""
+    groups = settings(UNIT.read_text())["SupplementaryGroups"][0].split()
+    assert groups == ["dialout", "mapquilt-keys"]
+    assert "\ngroup=mapquilt-keys\n" in (DEPLOY / "install.sh").read_text()
+
+
 def test_a_robot_never_gives_up_and_is_watched() -> None:
     unit = settings(UNIT.read_text())
     assert unit["Type"] == ["notify"]
