@@ -22,7 +22,7 @@ _LENGTHS |= {167: 16, 168: 4}  # of a command with its operands; those not here 
 _VALUES = {22: 15000, 23: -250, 24: 25, 25: 2500, 26: 2696, 34: 0, 58: 2}  # mV, mA, degrees, mAh, mAh, sources, stasis
 _DRIVE, _DRIVE_DIRECT, _DRIVE_PWM = 137, 145, 146
 _FULL_MM_S = 500.0  # at a PWM of 255
-ANSWER_S = 0.004  # a host may clear its input right after it has asked, as the real robot is not that quick
+ANSWER_S = 0.008  # of the 15 ms it may take; some hosts clear their input right after they have asked
 _BOOT = ((0.0, b"Soft reset!\n"), (1.0, b"\xfe"), (3.0, b"Roomba by iRobot!\r\nstm32\r\n"))  # seconds after RESET
 
 
