@@ -98,8 +98,8 @@ class Drawing:
     def _blank(self) -> Drawing:
         fresh = Drawing(self.options)
         fresh.grid = self.base.copy()
-        if self.oldest:
-            fresh.coarse.stamp(self._base_points_m())
+        if len(points_m := self._base_points_m()):
+            fresh.coarse.stamp(points_m)
         return fresh
 
     def _base_points_m(self) -> NDArray[np.float32]:
