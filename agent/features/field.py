@@ -37,7 +37,7 @@ class MatchField:
     coarse: NDArray[np.uint8]  # (H, W) the same, tolerance COARSE_TOLERANCE_M
     nearest: NDArray[
         np.float32
-    ]  # (H, W) index of the nearest wall point, -1 beyond REACH_M; float because cv2.remap takes no int32
+    ]  # (H, W) index of the nearest wall point, -1 out of reach; float because cv2.remap takes no int32
     distance_m: NDArray[np.float32]  # (H, W) to the nearest wall, at most `seen_m`
     wall_share: float  # of the cells that tell anything
     resolution_m: float
@@ -46,15 +46,16 @@ class MatchField:
     def of(grid: WorkingGrid, walls: WallPoints) -> MatchField:
         distance_m, nearest = _nearest_wall(grid, walls)
         bins = direction_bins(walls.angles_rad, DIRECTION_BINS)
-        direction = bins[np.maximum(nearest, 0)] if len(walls) else np.zeros(nearest.shape, np.uint8)
-        no_wall = _away_from_walls(grid)
-        return MatchField.made_of(
-            np.where(distance_m <= max(FINE_TOLERANCE_M, 1.25 * grid.resolution_m), direction, no_wall),
-            np.where(distance_m <= max(COARSE_TOLERANCE_M, 1.5 * grid.resolution_m), direction, no_wall),
-            np.where(distance_m <= REACH_M, nearest, -1).astype(np.float32),
-            np.minimum(distance_m, np.float32(seen_m(grid.resolution_m))),
-            grid.resolution_m,
-        )
+        fine = _away_from_walls(grid)
+        coarse = fine.copy()
+        for image, tolerance_m in (
+            (fine, max(FINE_TOLERANCE_M, 1.25 * grid.resolution_m)),
+            (coarse, max(COARSE_TOLERANCE_M, 1.5 * grid.resolution_m)),
+        ):
+            near = np.flatnonzero(distance_m <= tolerance_m)
+            image.ravel()[near] = bins[nearest.ravel()[near].astype(np.int64)]
+        seen = np.float32(seen_m(grid.resolution_m))
+        return MatchField.made_of(fine, coarse, nearest, np.minimum(distance_m, seen), grid.resolution_m)
 
     @staticmethod
     def made_of(
@@ -89,14 +90,18 @@ def _away_from_walls(grid: WorkingGrid) -> NDArray[np.uint8]:
     return said
 
 
-def _nearest_wall(grid: WorkingGrid, walls: WallPoints) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """(H, W) distance to the nearest surface cell, metres, and its row in `walls`."""
+def _nearest_wall(grid: WorkingGrid, walls: WallPoints) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(H, W) distance to the nearest surface cell, metres, and its row in `walls`, -1 out of reach."""
+    nearest = np.full(grid.free.shape, -1, np.float32)
     if not len(walls):
-        return np.full(grid.free.shape, np.inf, np.float32), np.full(grid.free.shape, -1, np.int32)
+        return np.full(grid.free.shape, np.inf, np.float32), nearest
     apart = np.ones(grid.free.shape, np.uint8)
     rows, cols = walls.cells_rc.T
     apart[rows, cols] = 0
     distance, labels = cv2.distanceTransformWithLabels(apart, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    index_of = np.zeros(len(walls) + 1, np.int32)
-    index_of[labels[rows, cols]] = np.arange(len(walls), dtype=np.int32)
-    return distance * np.float32(grid.resolution_m), index_of[labels]
+    index_of = np.zeros(len(walls) + 1, np.float32)
+    index_of[labels[rows, cols]] = np.arange(len(walls))
+    distance_m = distance * np.float32(grid.resolution_m)
+    near = np.flatnonzero(distance_m <= max(REACH_M, 1.5 * grid.resolution_m))
+    nearest.ravel()[near] = index_of[labels.ravel()[near]]
+    return distance_m, nearest
