@@ -132,8 +132,6 @@ class _WordAttack(Attack, Tap):
     def begin(self, fleet: Fleet, node: Node) -> None:
         node.tap = self
 
-    # `Tap.every_second` and `Attack.every_second` differ in arguments; the campaign calls the latter.
-
 
 class Equivocation(_WordAttack):
     """Tells every peer another transform under the same number."""
@@ -144,7 +142,7 @@ class Equivocation(_WordAttack):
             message = replace(message, evidence=replace(message.evidence, T_a_b=message.evidence.T_a_b @ turn))
         return [encode(message)]
 
-    def every_second(self, fleet: Fleet, node: Node, age_s: float) -> None:  # type: ignore[override]
+    def every_second(self, fleet: Fleet, node: Node, age_s: float) -> None:
         assert node.coordinator is not None
         for statement in list(node.coordinator._ledger.mine.values()):
             fleet.publish(node, statement)
@@ -153,7 +151,7 @@ class Equivocation(_WordAttack):
 class ProposalSpam(_WordAttack):
     """Proposes random transforms to everybody, ten a second."""
 
-    def every_second(self, fleet: Fleet, node: Node, age_s: float) -> None:  # type: ignore[override]
+    def every_second(self, fleet: Fleet, node: Node, age_s: float) -> None:
         coordinator = node.coordinator
         assert coordinator is not None
         for statement in list(coordinator._ledger.mine.values()):
@@ -178,20 +176,23 @@ class ForgedTiles(_WordAttack):
         delta: TileDelta = replace(message.delta, digest=lie)
         return encode(replace(message, delta=delta, map=replace(message.map, digest=lie)))
 
-    def every_second(self, fleet: Fleet, node: Node, age_s: float) -> None:  # type: ignore[override]
+    def every_second(self, fleet: Fleet, node: Node, age_s: float) -> None:
         liar = node.explorer
         assert isinstance(liar, Liar)
         flip = int(age_s) % 2
-        liar.change = lambda grid: replace(
-            grid, cells=np.where(np.eye(*grid.cells.shape, k=flip) > 0, UNKNOWN, grid.cells).astype(np.int8)
-        )
+
+        def change(grid: OccupancyGrid) -> OccupancyGrid:
+            is_striped = np.eye(grid.height, grid.width, k=flip) > 0
+            return replace(grid, cells=np.where(is_striped, UNKNOWN, grid.cells).astype(np.int8))
+
+        liar.change = change
         fleet.share_map(node)
 
 
 class Garbage(_WordAttack):
     """Noise on its own keys, a hundred a second, and messages in the names of others."""
 
-    def every_second(self, fleet: Fleet, node: Node, age_s: float) -> None:  # type: ignore[override]
+    def every_second(self, fleet: Fleet, node: Node, age_s: float) -> None:
         for other in fleet.nodes.values():
             if other is not node:
                 for _ in range(100):
@@ -212,7 +213,7 @@ class FalseRecipes(_WordAttack):
             message = replace(message, members=moved, digest=bytes(16))
         return [encode(message)]
 
-    def every_second(self, fleet: Fleet, node: Node, age_s: float) -> None:  # type: ignore[override]
+    def every_second(self, fleet: Fleet, node: Node, age_s: float) -> None:
         assert node.coordinator is not None
         meta = node.coordinator._composition.meta
         if meta is not None:

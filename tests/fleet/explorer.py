@@ -72,8 +72,8 @@ class Explorer:
         known = np.where(self.seen, self.world.cells, UNKNOWN).astype(np.int8)
         seen = OccupancyGrid(known, cell_m, self.world.origin).cropped()
         width_m, height_m = seen.width * cell_m, seen.height * cell_m
-        corners = seen.origin.apply([[0, 0], [width_m, 0], [0, height_m], [width_m, height_m]])
-        corners = self.T_world_map.inverse().apply(corners)
+        corners = np.array([[0.0, 0.0], [width_m, 0.0], [0.0, height_m], [width_m, height_m]])
+        corners = self.T_world_map.inverse().apply(seen.origin.apply(corners))
         low = np.floor(corners.min(axis=0) / cell_m).astype(int)
         size = np.ceil(corners.max(axis=0) / cell_m).astype(int) - low + 1
         frame = OccupancyGrid(np.full((size[1], size[0]), UNKNOWN, np.int8), cell_m, SE2(low[0] * cell_m, low[1] * cell_m, 0.0))

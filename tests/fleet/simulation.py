@@ -75,9 +75,6 @@ class Tap:
         """What really is answered to a query."""
         return data
 
-    def every_second(self, fleet: Fleet, node: Node) -> None:
-        """Mischief without an occasion."""
-
 
 Judge = Callable[["Fleet", Node, Match], MergeResult]
 

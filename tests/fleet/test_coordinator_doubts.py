@@ -13,10 +13,10 @@ from agent.fleet.effects import Fetch, Match, MatchKind, Send
 from agent.fleet.members import Roster
 from agent.fleet.options import FleetOptions
 from agent.merging.result import MatchFactor, MatchStatus, MergeResult
-from protocol.codec import encode
+from protocol.codec import decode, encode
 from protocol.features import FeatureMap
 from protocol.geometry import SE2
-from protocol.messages import Beat, MapAnnouncement, MapVersion, Stance, Statement
+from protocol.messages import Beat, FineTiles, MapAnnouncement, MapVersion, Message, Stance, Statement
 from tests.fleet.explorer import Explorer, random_world
 from tests.fleet.groups import PLACES, WORLD, edges, events, fleet_of, names
 from tests.fleet.simulation import Fleet, Node, truthful
@@ -122,10 +122,9 @@ def test_cells_that_are_not_what_was_announced_are_not_taken() -> None:
     coordinator.on_message(other._ledger.own.announcement, 0.1)  # type: ignore[arg-type]
     effects = list(coordinator.tick(0.2))
     fetch = next(effect for effect in effects if isinstance(effect, Fetch))
-    from protocol.codec import decode  # noqa: PLC0415
-
-    answer = decode(other.register(fetch.key))  # type: ignore[arg-type]
-    forged = replace(answer, delta=replace(answer.delta, digest=bytes(16)), map=replace(answer.map, digest=bytes(16)))  # type: ignore[union-attr, call-arg]
+    answer = decode(other.register(fetch.key) or b"")
+    assert isinstance(answer, FineTiles)
+    forged = replace(answer, delta=replace(answer.delta, digest=bytes(16)), map=replace(answer.map, digest=bytes(16)))
     coordinator.on_fetched(fetch, forged, 0.3)
     peer = coordinator._ledger.peers["r1"]
     assert peer.held is None
@@ -136,7 +135,7 @@ def test_late_doubled_and_reordered_words_change_nothing() -> None:
     fleet = fleet_of(2)
     node = fleet.nodes["r0"]
     assert node.coordinator is not None
-    heard: list[object] = []
+    heard: list[Message] = []
     original = node.coordinator.on_message
 
     def listen(message, now_s):  # type: ignore[no-untyped-def]

@@ -1,4 +1,4 @@
-"""Waiting for what a device says, with a deadline."""
+"""Waiting for what a device says, with a deadline, and how long a deadline is on a machine that is busy."""
 
 from __future__ import annotations
 
@@ -27,3 +27,11 @@ def until(holds: Callable[[], bool], seconds: float, what: str = "it") -> float:
             raise AssertionError(f"{what} did not happen within {seconds} s")
         time.sleep(0.005)
     return time.monotonic() - begun_s
+
+
+def slowness(work_s: float = 0.05) -> float:
+    """How much longer work takes here and now than its processor time: 1 on a quiet machine."""
+    began_s, spent_s = time.monotonic(), time.thread_time()
+    while time.thread_time() - spent_s < work_s:
+        pass
+    return max(1.0, (time.monotonic() - began_s) / work_s)
