@@ -22,7 +22,12 @@ class PairWords:
         self.remembered: dict[str, SE2] = {}  # T_ours_theirs of a life before: tried once, then forgotten
 
     def pair(self, peer: str) -> Pair:
-        return self.pairs.setdefault(peer, Pair(peer))
+        known = self.pairs.get(
+            peer
+        )  # asked thousands of times a second in a large fleet: `setdefault` would make a new one each time
+        if known is None:
+            known = self.pairs[peer] = Pair(peer)
+        return known
 
     def hint(self, peer: str) -> SE2 | None:
         """Where this peer's map lay on ours before one of them was begun or read anew."""
