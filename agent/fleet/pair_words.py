@@ -22,9 +22,7 @@ class PairWords:
         self.remembered: dict[str, SE2] = {}  # T_ours_theirs of a life before: tried once, then forgotten
 
     def pair(self, peer: str) -> Pair:
-        known = self.pairs.get(
-            peer
-        )  # asked thousands of times a second in a large fleet: `setdefault` would make a new one each time
+        known = self.pairs.get(peer)  # not `setdefault`, which makes a new one at each of thousands of questions a second
         if known is None:
             known = self.pairs[peer] = Pair(peer)
         return known
