@@ -134,7 +134,9 @@ def campaign(bare: Bare, *, is_tested: bool) -> Iterator[Claim]:
         not mdwe.returncode,
     )
     yield from checkout(bare, is_tested=is_tested)
-    _, gone = bare.run(f"/src/deploy/install.sh --uninstall --purge && ! ls -d {STATE} 2>/dev/null && ! getent group mapquilt-keys")
+    _, gone = bare.run(
+        f"/src/deploy/install.sh --uninstall --purge && ! ls -d {STATE} 2>/dev/null && ! getent group mapquilt-keys"
+    )
     yield Claim("uninstalled, nothing is left", "nothing", "nothing" if not gone.returncode else "NOT", not gone.returncode)
 
 
