@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from agent.fleet.frame_graph import Edge, Layout, solve
+from agent.fleet.frame_graph import Edge, Layout, connected, solve
 from protocol.geometry import SE2
 
 COVARIANCE = (1e-3, 0.0, 0.0, 1e-3, 0.0, 1e-5)
@@ -94,6 +94,17 @@ def test_what_no_edge_connects_are_two_groups() -> None:
     layout = solve([edge(truth, "r000", "r001"), edge(truth, "r002", "r003")])
     assert [group.root for group in layout.groups] == ["r000", "r002"]
     assert layout.group_of["r003"] is layout.groups[1]
+
+
+def test_the_edges_connected_to_a_robot_give_its_group_as_all_edges_do() -> None:
+    rng = random.Random(6)
+    truth = places(40, rng)
+    names = sorted(truth)
+    edges = [e for e in random_edges(truth, 3, rng, noise_m=0.02) if e.a[:3] == e.b[:3]]  # four groups, r00x to r03x
+    whole = solve(edges)
+    assert len(whole.groups) > 1
+    for robot in names:
+        assert solve(connected(edges, robot)).group_of.get(robot) == whole.group_of.get(robot)
 
 
 def test_the_order_of_the_edges_does_not_matter() -> None:
