@@ -17,8 +17,8 @@ from hw.rplidar_nodes import Node
 from hw.sim.sight import Floats, Sight, Turntable, joined, solve_angles
 
 TURN_HZ = 10.0
-BANNER = b"RP LIDAR System.\r\nFirmware Ver 1.29, HW Ver 7\r\nModel: 18\r\n"
-BOOT_S = 0.5
+BANNER = "RP LIDAR System.\r\nFirmware Ver {}.{:02d} - rtm, HW Ver {}\r\nModel: {:x}\r\n"  # some hosts count its bytes
+BOOT_S = 0.05
 CAPSULES = {kind.type: kind for kind in (Express(), Dense(), Ultra(), UltraDense())}
 
 
@@ -94,6 +94,7 @@ class RplidarSim:
         self._is_first = False
         self._held: tuple[int, list[int]] | None = None  # an ultra capsule waits for the first beam of the next
         self._booted_s = 0.0
+        self._is_booting = False
         self._is_turning = True  # a pseudo-terminal has no line that could stop the motor
 
     def set_lines(self, dtr: bool, rts: bool, now_s: float) -> None:
@@ -128,6 +129,7 @@ class RplidarSim:
     def _obey(self, request: wire.Request, now_s: float) -> None:
         command, payload = request.command, request.payload
         if command in (wire.STOP_CMD, wire.SCAN_CMD, 0x21, wire.EXPRESS_CMD, wire.RESET_CMD):
+            self._outbox += self._measured(now_s)  # what was on its way when it was told to stop
             self._mode, self._held = None, None
         if command == wire.RESET_CMD:
             self._reboot(now_s)
@@ -150,8 +152,8 @@ class RplidarSim:
 
     def _reboot(self, now_s: float) -> None:
         self._mode, self.health = None, wire.Health(0)
-        self._booted_s = now_s + BOOT_S
-        self._outbox += BANNER
+        self._booted_s, self._is_booting = now_s + BOOT_S, True
+        self._inbox.clear()
 
     def _tell(self, key: int, mode: int) -> None:
         modes = self.unit.modes
@@ -188,10 +190,18 @@ class RplidarSim:
 
     def emit(self, now_s: float) -> bytes:
         """See `ByteDevice`."""
+        if self._is_booting and now_s >= self._booted_s:
+            self._is_booting = False
+            info = self.unit.info
+            self._outbox += BANNER.format(*info.firmware, info.hardware, info.model).encode()
         out = bytes(self._outbox)
         self._outbox.clear()
+        return out + self._measured(now_s)
+
+    def _measured(self, now_s: float) -> bytes:
+        """What the scan has seen since this was last asked."""
         if not self._is_turning or self._mode is None or self._head is None or not (parts := self._head.due(now_s)):
-            return out
+            return b""
         index, times_s, cuts = joined(parts)
         turn_deg = index * 360.0 / self._head.beams_per_turn
         limits_m = (0.05, self.unit.range_max_m)
@@ -200,8 +210,8 @@ class RplidarSim:
         else:
             mm = self._sight.distances_mm(times_s, -np.radians(turn_deg), *limits_m)
         if self._mode.type == wire.NODE_TYPE:
-            return out + self._nodes(index, turn_deg, mm)
-        return out + b"".join(
+            return self._nodes(index, turn_deg, mm)
+        return b"".join(
             self._capsule(round(angles[0] * 64) % 23040, [int(v) for v in values])
             for angles, values in zip(np.split(turn_deg, cuts), np.split(mm, cuts), strict=True)
         )

@@ -51,6 +51,22 @@ def test_an_rplidar_tells_its_speeds_and_its_name(key: int, value: bytes) -> Non
     assert said == rplidar_wire.answer(rplidar_wire.CONF_TYPE, rplidar_wire.Conf(key, value).encode())
 
 
+def test_an_rplidar_says_hello_when_it_has_booted_and_hears_nothing_before() -> None:
+    lidar = RplidarSim("rplidar-a1", sight())
+    assert answer(lidar, rplidar_wire.request(rplidar_wire.RESET_CMD) + rplidar_wire.request(rplidar_wire.INFO_CMD), 0.0) == b""
+    hello = answer(lidar, rplidar_wire.request(rplidar_wire.HEALTH_CMD))
+    assert hello == b"RP LIDAR System.\r\nFirmware Ver 1.29 - rtm, HW Ver 7\r\nModel: 18\r\n"
+    assert len(hello) == 64, "some hosts count them"
+
+
+def test_an_rplidar_that_is_told_to_stop_has_measured_until_then() -> None:
+    lidar = RplidarSim("rplidar-a1", sight())
+    answer(lidar, rplidar_wire.request(rplidar_wire.SCAN_CMD))
+    lidar.receive(rplidar_wire.request(rplidar_wire.STOP_CMD), 5.11)
+    assert len(lidar.emit(5.12)) == 5 * 20, "2 kHz for 10 ms"
+    assert lidar.emit(5.2) == b""
+
+
 def test_a_hokuyo_reboots_when_it_is_told_twice() -> None:
     lidar = HokuyoSim(HOKUYOS["hokuyo-urg"], sight())
     assert answer(lidar, b"RB\n") == scip.encode_message(b"RB", b"01")
