@@ -7,6 +7,7 @@ believed.  Groups too large for every robot to hold every map take the cells fro
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Protocol
 
 from agent.fleet.credibility import objection
@@ -54,7 +55,7 @@ class Composition:
         self._made: Recipe | None = None  # what `global_map` was made from
         self._running: tuple[int, Recipe, float] | None = None
         self._composed_s = -1e9
-        self._fusing_took_s = 0.0
+        self._fusing_took_s: deque[float] = deque(maxlen=2)  # the last ones; a single long one is a process that was stopped
         self._grouped_s: float | None = None  # since when we are not alone
         self._followed_s: float | None = None  # since when there was a usable recipe, or we began to wait for one
         self._objection = ""  # to the composer's recipe
@@ -94,7 +95,7 @@ class Composition:
     def on_fused(self, job: Fuse, fused: Fused | None, now_s: float) -> None:
         if self._running is None or self._running[0] != job.id:
             return
-        self._fusing_took_s = now_s - self._running[2]
+        self._fusing_took_s.append(now_s - self._running[2])
         recipe, self._running = self._running[1], None
         if fused is None or self._ledger.group is None:
             return
@@ -133,7 +134,7 @@ class Composition:
         options, period_s = self._ledger.options, self._ledger.options.compose_period_s
         if self._made is not None and self._made.names == group.T_root.keys():
             period_s = max(period_s, options.compose_s_a_member * len(group.T_root))
-        return max(period_s, _FUSING_SHARE * self._fusing_took_s)
+        return max(period_s, _FUSING_SHARE * min(self._fusing_took_s, default=0.0))
 
     def _waits_for_recipes(self, group: Group, now_s: float) -> bool:
         """A newcomer first asks which frame the others share already; not for long."""

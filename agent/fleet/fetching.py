@@ -49,7 +49,7 @@ class Fetching:
             return None
         del self._running[name]
         if is_good:
-            self._forgive(fetch.peer)  # it answers again
+            self.forgive(fetch.peer)  # it answers again
         else:
             patience = self._patience.setdefault(name, _Patience())
             patience.failures += 1
@@ -58,11 +58,12 @@ class Fetching:
 
     def begin_anew(self, peer: str) -> None:
         """A peer that came back is asked at once, whatever went unanswered before."""
-        self._forgive(peer)
+        self.forgive(peer)
         for name in [name for name in self._running if name[0] == peer]:
             del self._running[name]
 
-    def _forgive(self, peer: str) -> None:
+    def forgive(self, peer: str) -> None:
+        """A peer that is heard again after some silence: what failed meanwhile may be asked again at once."""
         for name in [name for name in self._patience if name[0] == peer]:
             del self._patience[name]
 

@@ -6,7 +6,7 @@ from agent.fleet.composition import Composition
 from agent.fleet.consistency import is_same_drawing
 from agent.fleet.fetching import Fetching
 from agent.fleet.ledger import Ledger
-from agent.fleet.members import Peer, newer_statements
+from agent.fleet.members import Peer, newer_statements, still_beats
 from agent.fleet.pairs import PairWork
 from agent.fleet.state import Presence
 from protocol.errors import RemoteProtocolError
@@ -73,11 +73,13 @@ class Inbox:
                 pass
 
     def _on_beat(self, peer: Peer, beat: Beat, now_s: float) -> None:
-        before = peer.map
+        before, is_back = peer.map, not still_beats(peer, now_s)
         if not self._ledger.roster.accept_beat(peer, beat, now_s):
             return
         if peer.presence is not Presence.ALIVE:
             self._fetching.begin_anew(peer.robot)
+        elif is_back:
+            self._fetching.forgive(peer.robot)
         self._check_frame(peer, before, now_s)
 
     def _on_announcement(self, peer: Peer, said: MapAnnouncement, now_s: float) -> None:

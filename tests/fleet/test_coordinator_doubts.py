@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from agent.fleet.coordinator import Coordinator
-from agent.fleet.effects import Fetch, Match, MatchKind, Send
+from agent.fleet.effects import Fetch, Fuse, Match, MatchKind, Send
 from agent.fleet.members import Roster
 from agent.fleet.options import FleetOptions
 from agent.merging.result import MatchFactor, MatchStatus, MergeResult
@@ -98,6 +98,31 @@ def test_nothing_depends_on_the_clock_being_right() -> None:
         fleet.run(1.0)
     fleet.run_until(lambda: fleet.agrees(names(3)), 20.0)
     assert not [note for node in fleet.nodes.values() for note in node.notes if note.event == "peer-lost"]
+
+
+def test_a_composer_that_was_stopped_while_it_fused_composes_on_as_before() -> None:
+    fleet = fleet_of(2)
+    fleet.run_until(lambda: fleet.agrees(names(2)), 10.0)
+    fleet.run(3.0)
+    composer, other, fuse = fleet.nodes["r0"], fleet.nodes["r1"], fleet._fuse
+
+    def stopped(node: Node, job: Fuse) -> None:
+        fuse(node, job)
+        if node is composer:
+            node.clock_offset_s += 60.0
+            fleet._fuse = fuse  # type: ignore[method-assign]
+
+    def area_m2() -> float:
+        return composer.global_map.grid.known_area_m2() if composer.global_map is not None else 0.0
+
+    fleet._fuse = stopped  # type: ignore[method-assign]
+    for place in (PLACES[4], PLACES[5]):
+        assert other.explorer is not None
+        before_m2 = area_m2()
+        other.explorer.look(place, 12)
+        fleet.share_map(other)
+        assert fleet.run_until(lambda: area_m2() > before_m2, 20.0) < 5.0  # noqa: B023
+    assert fleet._fuse == fuse
 
 
 def test_a_statement_changed_under_its_number_ends_in_quarantine() -> None:
