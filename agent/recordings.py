@@ -38,6 +38,8 @@ class Readings:
 
 def open_recording(path: Path, scan_topic: str | None = None, odometry_topic: str | None = None) -> Readings:
     """By what the file is; RecordingError when it is none of those."""
+    if not path.exists():
+        raise RecordingError(f"{path}: no such recording")
     if path.is_dir() and not (path / "metadata.yaml").is_file():
         raise RecordingError(f"{path}: a folder without metadata.yaml; is this a rosbag2 recording?")
     if path.is_dir() or path.suffix in (".mcap", ".db3", ".bag"):

@@ -38,7 +38,7 @@ READS = ["declare_subscriber", "query", "liveliness_query", "declare_liveliness_
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("action", choices=("init", "enroll", "revoke", "list"))
     parser.add_argument("folder", type=Path, metavar="DIR", help="where the keys are kept; back it up, show it to nobody")
-    parser.add_argument("names", nargs="*", metavar="ROBOT", help="robots to enroll or revoke")
+    parser.add_argument("names", nargs="*", default=[], metavar="ROBOT", help="robots to enroll or revoke")
     parser.add_argument("--fleet", default="mapquilt", metavar="NAME", help="the fleet's name (init)")
     parser.add_argument("--router", action="store_true", help="these are routers (enroll)")
 

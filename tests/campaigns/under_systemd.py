@@ -117,8 +117,8 @@ def booted(root: Path) -> Iterator[Booted]:
 def story(system: Booted) -> Iterator[Claim]:
     seconds, is_up = system.timed(f"systemctl enable --now {SERVICE}")
     yield Claim("systemctl enable --now, until READY", "<= 10 s", f"{seconds:.1f} s", is_up and seconds <= 10)
-    who = system.run(f"stat -c %U /proc/{system.asked('MainPID')}").stdout.strip()
-    yield Claim("its user", "not root", who, who not in ("", "root"))
+    who = system.run(f"stat -c %u /proc/{system.asked('MainPID')}").stdout.strip()
+    yield Claim("its user", "not root", f"uid {who}", who not in ("", "0"))
     is_seen = "robot-1  up" in system.run("sleep 2; mapquilt status").stdout
     yield Claim("sudo mapquilt status sees it", "yes", "yes" if is_seen else "NO", is_seen)
     seconds, is_back = system.back_after("KILL")
