@@ -10,7 +10,8 @@ import os
 import sys
 from collections.abc import Iterator
 
-from agent.commands.doctor_checks import CHECKS, Finding, Level, Machine
+from agent.commands.doctor_checks import CHECKS
+from agent.commands.doctor_findings import Finding, Level, Machine
 from agent.config import Config
 from agent.config_flags import add_config_arguments, load_from
 from agent.exits import NEGATIVE, OK, CommandError

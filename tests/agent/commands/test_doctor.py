@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from agent.commands import doctor_checks as checks
-from agent.commands.doctor_checks import Check, Finding, Level, Machine
+from agent.commands.doctor_findings import Check, Finding, Level, Machine
 from agent.config import Config, FleetConfig, LidarConfig, RobotConfig, StateConfig, ViewConfig
 from tests.agent.commands.conftest import FakeRobot, Run
 
