@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.features.circle_fits import MAX_PIECE_CELLS, MIN_CELLS, Pieces, best_arcs, tolerance_m
+from agent.features.circle_fits import MIN_CELLS, best_arcs
+from agent.features.circle_hypotheses import MAX_PIECE_CELLS, Pieces, tolerance_m
 from protocol.features import ARC_COLUMNS, CIRCLE_COLUMNS
 
 CIRCLE_SPAN_RAD = math.radians(290)  # seen from nearly all sides: a circle, not an arc
