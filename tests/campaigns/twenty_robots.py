@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections import Counter
 from typing import Any
 
 from tests.bench.tables import print_row
@@ -42,18 +43,22 @@ def campaign(args: argparse.Namespace) -> dict[str, Any]:
         fleet.begin(stage)
         started = time.monotonic()
         names, merged_s, agreed_s, most, rss_mb = [actor.name for actor in stage.robots], None, None, 0, 0.0
+        digests: Counter[str | None] = Counter()
         while merged_s is None and time.monotonic() - started < 60 * args.minutes:
-            members = max(len(fleet.members(name)) for name in names)
+            held = [len(fleet.members(name)) for name in names]
+            members = max(held)
             rss_mb = max(rss_mb, *(resident_mb(fleet.agents[name].process.pid) for name in names))
             if members > most:
                 most = members
                 print(f"{time.monotonic() - started:5.0f} s: {most} robots in one map, {rss_mb:.0f} MB", file=sys.stderr)
-            if most == args.robots:
+            if min(held) == args.robots:  # a robot that lost itself begins a new map, and is out until it fits
                 merged_s = time.monotonic() - started
             time.sleep(1.0)
         if merged_s is not None:
             agreed_s = fleet.seconds_to_one_map_at_rest(names)
+            digests = Counter(fleet.global_digest(name) for name in names)
             rss_mb = max(rss_mb, *(resident_mb(fleet.agents[name].process.pid) for name in names))
+        together = max((count for digest, count in digests.items() if digest is not None), default=0)
         total_mb = sum(own_share_mb(fleet.agents[name].process.pid) for name in names)
         statuses = [fleet.status(name) for name in names]
         for error in sorted(
@@ -66,6 +71,7 @@ def campaign(args: argparse.Namespace) -> dict[str, Any]:
         "in one map": most,
         "one map": agreed_s is not None,
         "seconds until all are in": merged_s,
+        "robots with one digest, mapping paused": together,
         "seconds to one digest everywhere, mapping paused": agreed_s,
         "largest RSS MB": rss_mb,
         "all together MB (PSS)": total_mb,
