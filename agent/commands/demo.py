@@ -38,7 +38,7 @@ EXAMPLES = """\
   mapquilt demo --no-serve --json             for scripts: figures as one JSON object
 """
 
-DURATION_S = 40.0  # exploring goes on this long although the maps may fit sooner: a person sees the map grow
+DURATION_S = 25.0  # exploring goes on this long although the maps may fit sooner: a person sees the map grow
 LOOK_EVERY_S = 0.5
 FIRST_SCANS_WITHIN_S = 5.0
 
@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robots", type=int, default=0, metavar="N", help="how many (default: 3; a recording is cut for 2)")
     parser.add_argument("--world", default="office", help="office, outdoor, random, a world file, or log:FILE.clf[.gz]")
     parser.add_argument("--seed", type=int, default=0, help="another building, other starts, other noise")
-    parser.add_argument("--duration", type=float, metavar="S", help="seconds of exploring (default: 40, or the whole recording)")
+    parser.add_argument("--duration", type=float, metavar="S", help="seconds of exploring (default: 25, or the whole recording)")
     parser.add_argument(
         "--out", type=Path, default=Path("out/demo"), metavar="DIR", help="where pictures and figures go (default: out/demo)"
     )
