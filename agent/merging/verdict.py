@@ -24,6 +24,8 @@ FACTOR_SLOPE = 0.3  # coarser cells disagree more at the truth, by this a metre 
 MAX_SUSPICION = 1.4  # true pairs of bent maps reach 1.6
 MARGIN_PER_SUSPICION_M = 6.5
 MARGIN_PER_BARE_SUSPICION_M = 12.0  # where little else than long walls agrees: ends of a plan merged wrongly up to 11 a unit
+GRAVE_SUSPICION = 0.8  # few true pairs look worse, and those that do are far ahead of any rival;
+MARGIN_PER_GRAVE_SUSPICION_M = 45.0  # mirrored parts of a building at 1.2 were ahead by 20 m
 MIN_DISTINCT_M = 4.0  # two ends of a building share long walls; what tells them apart is short,
 CLEAR_MARGIN_M = 25.0  # unless nothing else comes near: ends that were merged wrongly were ahead by 7 to 13 m
 
@@ -73,7 +75,8 @@ def verdict(grounds: Grounds, options: MatchOptions) -> tuple[MatchStatus, str]:
     if g.score - g.rival <= _needed_margin_m(g, options) or g.rival >= options.max_rival_share * g.score:
         return MatchStatus.AMBIGUOUS, Reason.RIVAL
     is_bare = g.distinct_m < MIN_DISTINCT_M and g.score - g.rival < CLEAR_MARGIN_M
-    if g.suspicion > MAX_SUSPICION or is_bare:
+    grave_m = options.min_margin_m + MARGIN_PER_GRAVE_SUSPICION_M * (g.suspicion - GRAVE_SUSPICION)
+    if g.suspicion > MAX_SUSPICION or is_bare or g.score - g.rival <= grave_m:
         return MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE
     return MatchStatus.MERGED, Reason.MATCHED
 

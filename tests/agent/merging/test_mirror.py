@@ -18,17 +18,20 @@ from tests.harness.floorplans import office
 TEMPTING = (631206797, 585936016, 321424425, 25991004, 20024775)  # plans whose mirror images fit over 50 m of wall
 
 
-def plan_map(seed: int, yaw_rad: float = 0.4, noise_seed: int = 1, part: tuple[float, float] = (-1.0, 1e3)) -> MapSnapshot:
-    return MapSnapshot.of(office(seed).mapped(SE2(1.0, 2.0, yaw_rad), x_range_m=part, noise_m=0.02, seed=noise_seed))
+def plan_map(
+    seed: int, yaw_rad: float = 0.4, noise_seed: int = 1, part: tuple[float, float] = (-1.0, 1e3), hit: bool = False
+) -> MapSnapshot:
+    return MapSnapshot.of(office(seed).mapped(SE2(1.0, 2.0, yaw_rad), x_range_m=part, noise_m=0.02, seed=noise_seed, hit=hit))
 
 
 def is_suspected(ours: MapSnapshot, theirs: MapSnapshot) -> bool:
     return is_mirror_image(ours, theirs, weighed(ours, theirs, search(ours, theirs, FIRST_PASS)[0])[0])
 
 
+@pytest.mark.parametrize("hit", [False, True])
 @pytest.mark.parametrize("seed", TEMPTING)
-def test_a_mirrored_plan_never_merges(seed: int) -> None:
-    ours, theirs = plan_map(seed), mirrored(plan_map(seed, -1.3, noise_seed=2))
+def test_a_mirrored_plan_never_merges(seed: int, hit: bool) -> None:
+    ours, theirs = plan_map(seed, hit=hit), mirrored(plan_map(seed, -1.3, noise_seed=2, hit=hit))
     assert not match_maps(ours, theirs).accepted
     assert not match_maps(theirs, ours).accepted
 

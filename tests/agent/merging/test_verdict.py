@@ -22,6 +22,8 @@ GOOD = Grounds(
     deep_doubt=0.01,
     distinct_m=20.0,
 )
+# what two parts of a building had to say for each other, one of them turned over
+MIRRORED_PARTS = {"score": 22.6, "rival": 2.6, "factor": 0.94, "attached_doubt": 0.29, "deep_doubt": 0.08}
 
 
 def test_good_grounds_merge() -> None:
@@ -51,6 +53,7 @@ def test_little_but_long_walls_must_be_less_suspicious() -> None:
         ({"rival": 30.0}, MatchStatus.AMBIGUOUS, Reason.RIVAL),
         ({"distinct_m": 3.5, "score": 24.0}, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
         ({"factor": 0.88, "attached_doubt": 0.6, "deep_doubt": 0.05}, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
+        (MIRRORED_PARTS, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
     ],
 )
 def test_one_thing_missing_does_not(change: dict[str, float], status: MatchStatus, reason: str) -> None:
