@@ -60,7 +60,7 @@ def feature_map(
     circles, round_pieces = as_tables(arcs)
     curves = curve_table(cells_m[rest], walls.normals[rest].astype(np.float64), working.resolution_m)
     return FeatureMap(
-        lines.table(T_map_grid)[kept],
+        lines.table(T_map_grid)[kept & lines.is_distinct],
         _moved(circles, T_map_grid, turned=()),
         _moved(round_pieces, T_map_grid, turned=(3,)),
         _moved(curves, T_map_grid, turned=(2,)),

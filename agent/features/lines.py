@@ -39,6 +39,7 @@ class WallLines:
     lengths_m: NDArray[np.float64]  # (N,)
     sigma_theta_rad: NDArray[np.float64]  # (N,)
     sigma_rho_m: NDArray[np.float64]  # (N,)
+    is_distinct: NDArray[np.bool_]  # (N,) no longer line has most of its points: layers overlap, and may find a wall twice
     support_m: NDArray[np.float64]  # (wall points,) length of the line a wall point lies on, 0 for none
 
     def __len__(self) -> int:
@@ -67,17 +68,23 @@ def wall_lines(walls: WallPoints, resolution_m: float) -> WallLines:
     """The straight pieces of wall of one map."""
     straight = np.flatnonzero(walls.linearity > MIN_LINEARITY)
     points, angles = walls.positions_m[straight].astype(np.float64), walls.angles_rad[straight]
-    support = np.zeros(len(walls))
-    found = [np.zeros((0, 6))]
+    found, members, owners, lines = [np.zeros((0, 6))], [straight[:0]], [straight[:0]], 0
     for centre in _layer_centres(angles):
         mine = np.flatnonzero(angle_apart(angles, centre) < math.radians(LAYER_HALF_WIDTH_DEG))
         if len(mine) >= MIN_POINTS:
-            rows, lengths = _pieces(points[mine], centre, resolution_m)
+            rows, owner = _pieces(points[mine], centre, resolution_m)
             found.append(rows)
-            support[straight[mine]] = np.maximum(support[straight[mine]], lengths)
-    rows = np.concatenate(found)
-    rows = rows[np.argsort(-rows[:, 3], kind="stable")[:MAX_LINES]]
-    return WallLines(rows[:, :2], rows[:, 2], rows[:, 3], rows[:, 4], rows[:, 5], support)
+            members.append(straight[mine[owner >= 0]])
+            owners.append(owner[owner >= 0] + lines)
+            lines += len(rows)
+    rows, member, owner = np.concatenate(found), np.concatenate(members), np.concatenate(owners)
+    support = np.zeros(len(walls))
+    np.maximum.at(support, member, rows[owner, 3])
+    is_longest = rows[owner, 3] >= support[member]
+    is_distinct = 2 * np.bincount(owner[is_longest], minlength=lines) >= np.bincount(owner, minlength=lines)
+    order = np.argsort(-rows[:, 3], kind="stable")[:MAX_LINES]
+    rows = rows[order]
+    return WallLines(rows[:, :2], rows[:, 2], rows[:, 3], rows[:, 4], rows[:, 5], is_distinct[order], support)
 
 
 def _layer_centres(angles_rad: NDArray[np.floating]) -> list[float]:
@@ -98,8 +105,8 @@ def _layer_centres(angles_rad: NDArray[np.floating]) -> list[float]:
     return centres
 
 
-def _pieces(mine: NDArray[np.float64], centre_rad: float, resolution_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(N, 6) middle, angle, length, sigma_theta, sigma_rho of the lines in one layer; and for every point its line's length."""
+def _pieces(mine: NDArray[np.float64], centre_rad: float, resolution_m: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """(N, 6) middle, angle, length, sigma_theta, sigma_rho of the lines in one layer; and every point's line, -1 for none."""
     normal = np.array([math.cos(centre_rad), math.sin(centre_rad)])
     tangent = np.array([normal[1], -normal[0]])  # so that (tangent, normal) is right-handed
     along, across = mine @ tangent, mine @ normal
@@ -126,7 +133,8 @@ def _pieces(mine: NDArray[np.float64], centre_rad: float, resolution_m: float) -
     sigma_theta = math.sqrt(12) * sigma_rho / np.maximum(length, 1e-6)
     angle = np.remainder(centre_rad + turn + math.pi, math.tau) - math.pi
     rows = np.column_stack([middles, angle, length, sigma_theta, sigma_rho])[keep]
-    return rows, np.where(keep[piece] & (np.abs(beside) < MAX_AWAY_M), length[piece], 0.0)
+    line = np.where(keep, np.cumsum(keep) - 1, -1)
+    return rows, np.where(np.abs(beside) < MAX_AWAY_M, line[piece], -1)
 
 
 def angle_apart(angles_rad: NDArray[np.floating], centre_rad: float) -> NDArray[np.floating]:

@@ -57,6 +57,18 @@ def test_what_an_arc_explains_is_no_line_as_well():
     assert (lines[:4, 3] > 17).all()
 
 
+@pytest.mark.parametrize("seed", [3, 9])
+def test_no_wall_is_two_lines_however_noisy(seed: int):
+    lines = extract_features(office(seed).mapped(SE2(1.0, 2.0, 0.4), noise_m=0.05, seed=1)).lines
+    for x, y, angle, length, *_ in lines:
+        away = lines[:, :2] - (x, y)
+        beside = away @ (math.cos(angle), math.sin(angle))
+        ahead = away @ (-math.sin(angle), math.cos(angle))
+        alike = np.abs(wrap_angles(lines[:, 2] - angle)) < math.radians(4)
+        same_wall = alike & (np.abs(beside) < 0.08) & (np.abs(ahead) < 0.5 * length) & (lines[:, 3] < length)
+        assert not same_wall.any()
+
+
 def test_what_is_neither_straight_nor_round_is_a_curve():
     curves = extract_features(hall()).curves
     on_screen = (np.abs(curves[:, 0] - 12.5) < 1.0) & (curves[:, 1] > 9.5) & (curves[:, 1] < 16)
