@@ -50,12 +50,16 @@ def _record(device: Device, recorder: Recorder, seconds: float) -> int:
     """Let the device run for so long, or until Ctrl-C; how many readings it gave."""
     device.record(recorder)
     end_s = time.monotonic() + (seconds + START_S if seconds else float("inf"))
-    has_begun = False
+    has_begun, told = False, ""
     try:
         with device:
             while time.monotonic() < end_s:
-                if device.read(0.2) is not None and seconds and not has_begun:
+                has_reading, error = device.read(0.2) is not None, device.health().last_error
+                if has_reading and seconds and not has_begun:
                     has_begun, end_s = True, time.monotonic() + seconds
+                if not has_reading and error and error != told:
+                    print(f"waiting: {error}", file=sys.stderr, flush=True)
+                    told = error
     except KeyboardInterrupt:
         pass
     return device.health().readings

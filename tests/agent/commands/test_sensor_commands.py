@@ -60,6 +60,14 @@ def test_record_and_replay(lidar: SerialDevice, tmp_path: Path, capsys: pytest.C
     assert len(lines) >= 4 and lines[0]["points"] == 450
 
 
+def test_record_says_what_it_waits_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("agent.commands.record.START_S", 0.5)
+    assert main(["record", f"ld06:{tmp_path}/none", str(tmp_path / "a.rec"), "--seconds", "0.1"]) == 1
+    assert capsys.readouterr().err.startswith(f"waiting: ld06:{tmp_path}/none: no such port")
+
+
 def test_devices_says_who_answers(lidar: SerialDevice, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["devices", "--probe", "--json", "--as", "ld06", str(lidar.link)]) == 0
     found = json.loads(capsys.readouterr().out)
