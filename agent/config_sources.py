@@ -23,6 +23,7 @@ from agent.config import ROBOT_ID, Config, ConfigError, Key, Value, default_robo
 
 PREFIX = "MAPQUILT_"
 NOT_SETTINGS = {"MAPQUILT_CONFIG", "MAPQUILT_SHARED"}  # ours as well, but no settings of a robot
+SYSTEM_CONFIG = Path("/etc/mapquilt/robot.toml")  # what deploy/install.sh writes
 MAX_FILE_BYTES = 1 << 20
 TRUE, FALSE = ("1", "true", "yes", "on"), ("0", "false", "no", "off")
 
@@ -54,7 +55,7 @@ def config_file(given: str | Path | None, environ: Mapping[str, str]) -> Path | 
     if asked:
         return Path(asked)
     home = environ.get("XDG_CONFIG_HOME") or str(Path(environ.get("HOME") or "~").expanduser() / ".config")
-    places = (Path(home) / "mapquilt" / "config.toml", Path("/etc/mapquilt/robot.toml"))
+    places = (Path(home) / "mapquilt" / "config.toml", SYSTEM_CONFIG)
     return next((place for place in places if place.is_file()), None)
 
 

@@ -12,8 +12,9 @@ from agent.config_sources import assignment, load_config
 
 
 @pytest.fixture
-def home(tmp_path: Path) -> dict[str, str]:
-    """An environment without any configuration."""
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+    """An environment without any configuration, also where a robot is installed."""
+    monkeypatch.setattr("agent.config_sources.SYSTEM_CONFIG", tmp_path / "etc" / "robot.toml")
     return {"HOME": str(tmp_path / "home"), "XDG_CONFIG_HOME": str(tmp_path / "config")}
 
 
@@ -46,6 +47,12 @@ def test_the_id_of_any_host_can_stand_in_a_key(monkeypatch: pytest.MonkeyPatch) 
     for host in ("Robot_7.lan", "-", "", "été", "x" * 64, "a b/*$#"):
         monkeypatch.setattr("socket.gethostname", lambda host=host: host)
         assert ROBOT_ID.fullmatch(default_robot_id()), host
+
+
+def test_an_installed_robot_reads_the_file_of_the_system(home: dict[str, str], tmp_path: Path) -> None:
+    (tmp_path / "etc").mkdir()
+    write(tmp_path / "etc" / "robot.toml", '[robot]\nid = "r9"\n')
+    assert load_config(environ=home).config.robot.id == "r9"
 
 
 def test_file_then_environment_then_flags(home: dict[str, str], tmp_path: Path) -> None:

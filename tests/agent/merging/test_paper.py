@@ -97,7 +97,7 @@ def test_guards_let_the_right_merge_pass(seed):
     ours, theirs, truth = halves(office(seed), overlap=0.4)
     result = guarded(ours, theirs)
     assert result.accepted
-    assert error_m(result.T_ours_theirs, truth, theirs) < 0.05
+    assert error_m(result.T_ours_theirs, truth, theirs) < ours.resolution_m
     assert result.score > result.runner_up_score + OPTIONS.min_margin_m
 
 
