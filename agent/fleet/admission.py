@@ -28,11 +28,11 @@ class Admission:
         assert peer.held is not None and peer.grid is not None
         group, own = self._ledger.group, self._ledger.own
         if group is None or peer.robot not in group.T_root or own.grid is None or own.version is None:
-            peer.admitted, peer.held_back_s = peer.held, None  # in no global map of ours
+            peer.admitted, peer.held_back_s, peer.judged = peer.held, None, ()  # in no global map of ours
             return
         T_ours_theirs = group.T_root[self._ledger.robot].inverse() @ group.T_root[peer.robot]
         is_checked, is_vouched = self._is_checked(peer), self._is_vouched_for(peer)
-        judged = (own.version.digest, peer.held.digest, is_checked, is_vouched)
+        judged = (own.version.digest, peer.held.digest, is_checked, is_vouched, self._is_neighbour(peer))
         if peer.judged == judged and (peer.held_back_s is None or now_s - peer.held_back_s < self._ledger.options.held_back_s):
             self._drop_misplaced(peer, T_ours_theirs)
             return

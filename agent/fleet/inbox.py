@@ -131,7 +131,7 @@ class Inbox:
             return
         peer.maps.add(tiles, needed=peer.admitted.digest if peer.admitted is not None else b"")
         if peer.held is not None and peer.held.frame != said.map.frame:
-            peer.anchor = None
+            peer.anchor, peer.judged = None, ()
             if peer.grid is not None and not is_same_drawing(peer.grid, tiles.grid()):
                 self._pairs.words.forget_hint(peer.robot)
         is_newest = peer.held is None or peer.held.frame != said.map.frame or said.map.revision > peer.held.revision

@@ -8,6 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from agent.fleet.admission import Admission
+from agent.fleet.ledger import Ledger
+from agent.fleet.members import Peer
 from protocol.features import FeatureMap
 from protocol.geometry import SE2
 from protocol.grid import FREE, OCCUPIED, OccupancyGrid
@@ -119,3 +122,37 @@ def test_the_version_a_recipe_uses_can_be_pulled_however_long_ago_it_was(is_used
         cells[0, i] = OCCUPIED
         assert own.publish(replace(own.grid, cells=cells), FeatureMap(), own.version.frame)
     assert (own.fine(b"", used) is not None) == is_used
+
+
+def admission_of(fleet: Fleet) -> tuple[Admission, Peer]:
+    """How r0 judges the cells of r1."""
+    coordinator = fleet.nodes["r0"].coordinator
+    assert coordinator is not None
+    return coordinator._admission, coordinator._ledger.peers["r1"]
+
+
+def test_cells_held_back_from_a_neighbour_are_judged_anew_when_it_is_one_no_longer() -> None:
+    fleet = merged_fleet(4)
+    admission, peer = admission_of(fleet)
+    admission._is_believed = lambda *args, **facts: not admission._is_neighbour(peer)  # type: ignore[method-assign]
+    admission._is_checked = lambda peer: False  # type: ignore[method-assign]
+    admission.admit(peer, fleet.now_s)
+    assert peer.held_back_s is not None
+    admission._is_neighbour = lambda peer: False  # type: ignore[method-assign]
+    admission.admit(peer, fleet.now_s)
+    assert peer.held_back_s is None
+
+
+def test_the_same_cells_are_judged_anew_after_a_twin_s_came_between(monkeypatch: pytest.MonkeyPatch) -> None:
+    fleet = merged_fleet(4)
+    admission, peer = admission_of(fleet)
+    assert peer.held is not None
+    peer.judged = ()
+    admission.admit(peer, fleet.now_s)
+    ours, peer.held = peer.held, replace(peer.held, frame=peer.held.frame ^ 1)  # the twin's, while r1 is in no group
+    with monkeypatch.context() as alone:
+        alone.setattr(Ledger, "group", None)
+        admission.admit(peer, fleet.now_s)
+    peer.held = ours
+    admission.admit(peer, fleet.now_s)
+    assert peer.admitted == ours
