@@ -135,7 +135,7 @@ def test_cells_held_back_from_a_neighbour_are_judged_anew_when_it_is_one_no_long
     fleet = merged_fleet(4)
     admission, peer = admission_of(fleet)
     admission._is_believed = lambda *args, **facts: not admission._is_neighbour(peer)  # type: ignore[method-assign]
-    admission._is_checked = lambda peer: False  # type: ignore[method-assign]
+    admission._is_checked, peer.judged = lambda peer: False, ()  # type: ignore[method-assign]
     admission.admit(peer, fleet.now_s)
     assert peer.held_back_s is not None
     admission._is_neighbour = lambda peer: False  # type: ignore[method-assign]
