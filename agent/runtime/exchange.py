@@ -12,41 +12,24 @@ from __future__ import annotations
 
 import json
 import logging
-import queue
 import threading
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 import zenoh
 
+from agent.runtime.answering import Answer, Answering
 from agent.runtime.latest import KeyedLatest
 from agent.runtime.network import NetworkSettings, zenoh_config
-from agent.runtime.pending import MAX_PAYLOAD_BYTES, Pending
+from agent.runtime.pending import Pending
+from agent.runtime.traffic import MAX_PAYLOAD_BYTES, Traffic
 
 log = logging.getLogger(__name__)
 
 QUERY_TIMEOUT_S = 5.0
 ASK_AGAIN_S = 1.5  # a question that went into a link just before it came back stays unanswered
 SLOW_FACTOR = 3.0  # over a slow radio the second question waits for this many times the time the last answer took
-MAX_QUERIES_WAITING = 256
-
-Answer = Callable[[str], "bytes | None"]  # key -> the register's content, ready to travel; runs on the answering thread
-
-
-@dataclass(slots=True)
-class Traffic:
-    """What passed through the door since the start."""
-
-    sent_bytes: int = 0
-    received_messages: int = 0
-    received_bytes: int = 0
-    pulled_bytes: int = 0
-    served_bytes: int = 0
-    refused: int = 0  # too large
-    unanswered: int = 0
-    dropped_queries: int = 0
 
 
 class Exchange:
@@ -59,12 +42,11 @@ class Exchange:
         self.inbox: KeyedLatest[bytes] = KeyedLatest(max_keys=1024)
         self.traffic = Traffic()
         self.closed = threading.Event()
-        self._answer, self._subscribe, self._serve = answer, tuple(subscribe), serve
-        self._queries: queue.Queue[Any] = queue.Queue(maxsize=MAX_QUERIES_WAITING)
+        self._subscribe, self._serve = tuple(subscribe), serve
         self._session: Any = None
         self._answer_took_s = 0.0  # the last one: a slow link is not asked twice
         self._swap = threading.Lock()  # opening and closing only
-        self._answering = threading.Thread(target=self._answer_queries, name="answers", daemon=True)
+        self._answering = Answering(answer, self.traffic, self.closed, zenoh.ZError)
 
     def __enter__(self) -> Exchange:
         self.open()
@@ -96,8 +78,7 @@ class Exchange:
         self.inbox.wake()
         with self._swap:
             self._close_session()
-        if self._answering.is_alive():
-            self._answering.join(2.0)
+        self._answering.join()
 
     def reopen(self, connect: tuple[str, ...]) -> None:
         """Start a new session with these endpoints: links learnt by gossip are never dialled again by Zenoh itself."""
@@ -126,7 +107,7 @@ class Exchange:
             for key in self._subscribe:
                 session.declare_subscriber(key, on_sample, allowed_origin=zenoh.Locality.REMOTE)  # not our own echo
             if self._serve is not None:
-                session.declare_queryable(self._serve, zenoh.handlers.Callback(self._on_query, indirect=False))
+                session.declare_queryable(self._serve, zenoh.handlers.Callback(self._answering.on_query, indirect=False))
         except BaseException:
             session.close()
             raise
@@ -136,9 +117,10 @@ class Exchange:
         session, self._session = self._session, None
         close(session)
 
-    # Callbacks: on Zenoh's thread, one bounded enqueue each.
+    # Hearing.
 
     def _on_sample(self, sample: Any) -> None:
+        """On Zenoh's thread: one bounded enqueue."""
         payload = sample.payload.to_bytes()
         self.traffic.received_messages += 1
         self.traffic.received_bytes += len(payload)
@@ -146,13 +128,6 @@ class Exchange:
             self.traffic.refused += 1
             return
         self.inbox.put(str(sample.key_expr), payload)
-
-    def _on_query(self, query: Any) -> None:
-        try:
-            self._queries.put_nowait(query)
-        except queue.Full:
-            self.traffic.dropped_queries += 1
-            query.drop()  # a query that is kept makes the other side wait for its timeout
 
     # Pushing.
 
@@ -175,29 +150,6 @@ class Exchange:
             return False
         self.traffic.sent_bytes += len(payload)
         return True
-
-    # Answering.
-
-    def _answer_queries(self) -> None:
-        while not self.closed.is_set():
-            try:
-                query = self._queries.get(timeout=0.2)
-            except queue.Empty:
-                continue
-            try:
-                with query:
-                    self._answer_query(query)
-            except zenoh.ZError as error:
-                log.debug("network: the asker is gone: %s", error)
-            except Exception:
-                log.exception("network: a query was not answered")
-
-    def _answer_query(self, query: Any) -> None:
-        key = str(query.key_expr)
-        content = None if "*" in key else self._answer(key)
-        if content is not None and len(content) <= MAX_PAYLOAD_BYTES:
-            query.reply(key, content)  # as droppable as the query it answers
-            self.traffic.served_bytes += len(content)
 
     # Asking.
 

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-MAX_PAYLOAD_BYTES = 32 * 1024  # hints are made for 16 KB, plus envelope; a single 200 KB put is silently lost on 20 Mbit/s
+from agent.runtime.traffic import MAX_PAYLOAD_BYTES
 
 
 class Pending:

@@ -19,11 +19,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from agent.config import Config
-from agent.runtime.exchange import Traffic
 from agent.runtime.latest import KeyedLatest
 from agent.runtime.network import NetworkSettings
 from agent.runtime.node import Node
 from agent.runtime.pace import Pace
+from agent.runtime.traffic import Traffic
 from hw.driver import Driver
 from protocol.channels import parse_key
 

@@ -15,8 +15,9 @@ import pytest
 
 from agent.runtime import announcer as announcer_module
 from agent.runtime import exchange as exchange_module
-from agent.runtime.exchange import MAX_PAYLOAD_BYTES, Exchange, ExchangeError
+from agent.runtime.exchange import Exchange, ExchangeError
 from agent.runtime.network import NetworkSettings
+from agent.runtime.traffic import MAX_PAYLOAD_BYTES
 
 ROOT = Path(__file__).resolve().parents[3]
 
