@@ -1,8 +1,6 @@
 """One table: every kind of message, the key it travels on, how urgent it is, and how large it may be.
 
-    mapquilt/@v1/<fleet>/r/<robot>/<register>      everything a robot says; it writes only below its own <robot>
-    mapquilt/@v1/<fleet>/r/<robot>/alive           liveliness token
-    mapquilt/@any/<fleet>/<robot>                  which versions it speaks: readable for every version, for ever
+    mapquilt/@v1/<fleet>/r/<robot>/<register>    everything a robot says; it writes only below its own <robot>
 
 The major version is a chunk of the key, and `**` never matches a chunk that starts with `@`: two versions never meet.
 """
@@ -79,11 +77,6 @@ def fleet_key(fleet: str, suffix: str = "**") -> str:
 def robot_key(fleet: str, robot: str, register: str) -> str:
     """The full key of one register of one robot."""
     return fleet_key(fleet, f"r/{_name(robot)}/{register}")
-
-
-def version_key(fleet: str, robot: str) -> str:
-    """The key that every version of this protocol reads, see `codec.encode_versions`."""
-    return f"mapquilt/@any/{_name(fleet)}/{_name(robot)}"
 
 
 def subscriptions(fleet: str) -> tuple[str, ...]:

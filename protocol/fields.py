@@ -1,4 +1,4 @@
-"""The strict readers and writers of single fields, out of which `codec.SCHEMAS` builds every message.
+"""The strict readers and writers of single fields, out of which `schemas.SCHEMAS` builds every message.
 
 A field kind turns a value into something msgpack knows and back.  Reading trusts nothing: type, range, length and
 finiteness are checked before anything is allocated, and the only error is `RemoteProtocolError`.

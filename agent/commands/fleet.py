@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from agent.exits import BAD_INPUT, ENVIRONMENT, OK, USAGE, CommandError
-from protocol.channels import fleet_key, robot_key, version_key
+from protocol.channels import fleet_key, robot_key
 from protocol.messages import is_robot_id
 
 EXAMPLES = """\
@@ -121,7 +121,7 @@ def access_control(fleet: str, members: dict[str, Any]) -> dict[str, Any]:
 
     `**` does not match a chunk that begins with `@`, so the admin space stays closed and our keys are written out.
     """
-    everything = [fleet_key(fleet), version_key(fleet, "x").rpartition("/")[0] + "/*"]
+    everything = [fleet_key(fleet)]
     rules = [
         {"id": "say", "messages": WRITES + READS, "flows": ["egress"], "permission": "allow", "key_exprs": everything},
         {"id": "read", "messages": READS, "flows": ["ingress"], "permission": "allow", "key_exprs": everything},
@@ -131,7 +131,7 @@ def access_control(fleet: str, members: dict[str, Any]) -> dict[str, Any]:
     policies: list[dict[str, Any]] = [{"rules": ["say"], "subjects": ["anybody"]}]
     for name, entry in sorted(members.items()):
         subjects.append({"id": name, "cert_common_names": [name]})
-        own = [robot_key(fleet, name, "**"), version_key(fleet, name), fleet_key(fleet, f"r/{name}-prior$*/**")]
+        own = [robot_key(fleet, name, "**"), fleet_key(fleet, f"r/{name}-prior$*/**")]
         rules.append({"id": f"write-{name}", "messages": WRITES, "flows": ["ingress"], "permission": "allow", "key_exprs": own})
         allowed = ["read", "carry"] if entry["role"] == "router" else ["read", f"write-{name}"]
         policies.append({"rules": allowed, "subjects": [name]})

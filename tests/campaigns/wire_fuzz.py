@@ -27,7 +27,7 @@ from typing import Any
 import msgpack
 
 from protocol.channels import BY_NUMBER, parse_key
-from protocol.codec import HEADER_BYTES, MAGIC, decode, decode_versions, encode
+from protocol.codec import HEADER_BYTES, MAGIC, decode, encode
 from protocol.errors import LocalProtocolError, RemoteProtocolError
 from protocol.messages import FineTiles, GlobalTiles
 from protocol.security import unseal
@@ -129,9 +129,8 @@ class Fuzzer:
 
 def check(data: bytes) -> str:
     """What became of one input; raises only for an escape or an accepted message that is not valid."""
-    for decoder in (decode_versions, lambda d: unseal(bytes(32), d)):
-        with contextlib.suppress(RemoteProtocolError):
-            decoder(data)
+    with contextlib.suppress(RemoteProtocolError):
+        unseal(bytes(32), data)
     with contextlib.suppress(RemoteProtocolError):
         parse_key(data[:200].decode("latin-1"))
     try:

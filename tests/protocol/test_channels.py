@@ -17,7 +17,6 @@ from protocol.channels import (
     push_register,
     robot_key,
     subscriptions,
-    version_key,
 )
 from protocol.codec import encode
 from protocol.errors import LocalProtocolError, RemoteProtocolError
@@ -27,7 +26,6 @@ from tests.protocol.examples import examples
 
 def test_keys_are_what_the_protocol_says() -> None:
     assert robot_key("lab", "r1", "map/feat") == "mapquilt/@v1/lab/r/r1/map/feat"
-    assert version_key("lab", "r1") == "mapquilt/@any/lab/r1"
     assert fleet_key("lab") == "mapquilt/@v1/lab/**"
     assert fine_register(b"", b"\x01" * 16) == "map/fine/-/" + "01" * 16
     assert global_register(b"\x02" * 16, b"") == "global/tiles/" + "02" * 16 + "/-"

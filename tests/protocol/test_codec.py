@@ -19,12 +19,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from protocol.channels import BY_KIND, BY_NUMBER, CHANNELS, MAX_ANSWER_BYTES
-from protocol.codec import HEADER_BYTES, MAGIC, SCHEMAS, decode, decode_versions, encode, encode_versions
+from protocol.codec import HEADER_BYTES, MAGIC, decode, encode
 from protocol.errors import LocalProtocolError, NewerPeer, RemoteProtocolError, TooLarge
 from protocol.features import FeatureMap
 from protocol.geometry import SE2
 from protocol.grid import OccupancyGrid
 from protocol.messages import Beat, Evidence, MapAnnouncement, Message, Stance, Statement
+from protocol.schemas import SCHEMAS
 from tests.protocol.examples import evidence, examples
 
 GOLDEN = json.loads((Path(__file__).parent / "golden_v1.json").read_text())
@@ -162,14 +163,6 @@ def test_a_newer_peer_is_told_apart_from_damage() -> None:
     with pytest.raises(RemoteProtocolError) as caught:
         decode(wrapped("hello", body, major=0))
     assert not isinstance(caught.value, NewerPeer)
-
-
-def test_the_version_message_is_the_same_for_ever() -> None:
-    assert encode_versions(1, 3) == b"MQ\x01\x03"
-    assert decode_versions(b"MQ\x01\x03 and whatever comes later") == (1, 3)
-    for bad in (b"", b"MQ\x01", b"XX\x01\x02", b"MQ\x03\x01"):
-        with pytest.raises(RemoteProtocolError):
-            decode_versions(bad)
 
 
 BOMBS = {
