@@ -13,12 +13,9 @@ from protocol.channels import CHUNK_BYTES, MAX_ANSWER_BYTES
 from protocol.errors import RemoteProtocolError
 from protocol.fields import (
     COVARIANCE,
-    FEATURES,
     FLAG,
-    GRID,
     NAME,
     RESOLUTION,
-    TILE_KEYS,
     TRANSFORM,
     Kind,
     blob,
@@ -30,6 +27,7 @@ from protocol.fields import (
     text,
     uint,
 )
+from protocol.map_fields import FEATURES, GRID, TILE_KEYS
 from protocol.tiles import TileDelta
 
 _REQUIRED = object()

@@ -24,9 +24,9 @@ from agent.features.extraction import extract_features
 from agent.features.snapshot import MapSnapshot
 from agent.merging.matched_features import matched_features
 from protocol.features import FeatureMap
-from protocol.fields import FEATURES
 from protocol.geometry import SE2, wrap_angle
 from protocol.grid import OccupancyGrid
+from protocol.map_fields import FEATURES
 from tests.bench.map_pairs import kit_pairs
 from tests.bench.tables import markdown
 from tests.harness.floorplans import office
