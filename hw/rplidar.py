@@ -16,7 +16,7 @@ from hw.framing import Bytes, ByteWindow, FixedFrames
 from hw.rplidar_capsule_chain import CapsuleChain
 from hw.rplidar_capsules import KINDS, frames_of, start_angles_q6
 from hw.rplidar_nodes import NodeFinder
-from hw.scan_assembler import Beams
+from hw.scan_assembler import WITNESSES, Beams
 from hw.spinning import Floats, Ints, SpinningLidar
 
 BAUDS = (115200, 460800, 256000, 1000000)
@@ -210,7 +210,9 @@ class Rplidar(SpinningLidar):
         self.counters.gap_bytes = 0
         if descriptor.is_multi:
             self.scan_type = descriptor.type
-            self._assembler.witnesses = (1, 3) if descriptor.type in KINDS else (1,)  # an XOR lets pairs of equal flips through
+            self._assembler.witnesses = (
+                (1, 3) if descriptor.type in KINDS else WITNESSES
+            )  # an XOR lets pairs of equal flips through
             self._restart_stream()
             self._drop_held()
             self._assembler.restart()

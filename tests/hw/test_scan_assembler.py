@@ -50,12 +50,21 @@ def test_on_a_dirty_line_a_lone_beam_says_nothing() -> None:
 
 def test_a_slanting_wall_supports_its_beams_and_an_edge_does_not() -> None:
     wall = 2.0 + 0.02 * np.arange(50.0)
-    assert np.isfinite(supported_only(wall)[1:-1]).all()
+    assert np.isfinite(supported_only(wall)[2:-2]).all()
     edge = np.where(np.arange(50) < 25, 2.0, 4.0)
-    assert np.flatnonzero(np.isnan(supported_only(edge)[1:-1])).tolist() == [23, 24]
+    assert np.flatnonzero(np.isnan(supported_only(edge)[2:-2])).tolist() == [21, 22, 23, 24]
     shifted = wall.copy()
     shifted[20:23] += 0.5
     assert np.isnan(supported_only(shifted, (1, 3))[20:23]).all()
+
+
+def test_neighbours_damaged_alike_do_not_bear_one_another_out() -> None:
+    """What an LD06 on a bad line really sent: 2.447 m between 2.505 m and a damaged 2.38 m; 5.484 m across a corner of 5.58 m."""
+    pair = np.array([2.5, 2.5, 2.501, 2.502, 2.503, 2.505, 2.447, 2.38, 2.514, 2.518, 2.522, 2.527])
+    assert np.isnan(supported_only(pair)[6])
+    corner = np.array([5.408, 5.44, 5.473, 5.508, 5.544, 5.484, 5.46, 5.325, 5.189, 5.061])
+    assert np.isnan(supported_only(corner)[5])
+    assert np.isfinite([supported_only(values, (1,))[at] for values, at in ((pair, 6), (corner, 5))]).all()
 
 
 def test_an_angle_out_of_line_is_seen() -> None:
