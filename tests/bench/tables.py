@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 
 def markdown(rows: Sequence[Mapping[str, object]]) -> str:
@@ -25,6 +26,13 @@ def line(row: Mapping[str, object], columns: Sequence[str]) -> str:
 def print_row(figures: Mapping[str, object], *, as_json: bool) -> None:
     """One row of Markdown, or one line of JSON."""
     print(json.dumps(figures) if as_json else markdown([figures]))
+
+
+def write_json(path: Path | None, figures: object) -> None:
+    """The figures in a file too, when one is named."""
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(figures, indent=1) + "\n")
 
 
 def _joined(cells: Sequence[str]) -> str:

@@ -10,6 +10,7 @@ columns are the verdict on a pair that is aligned already, of which one map has 
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import time
 from collections import defaultdict
@@ -100,6 +101,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tiles", type=int, default=4)
     parser.add_argument("--kit-stride", type=int, default=8, metavar="N", help="every N-th fitting pair of the kit (default 8)")
+    parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     cv2.setNumThreads(1)
     rng = np.random.default_rng(1)
@@ -110,11 +112,12 @@ def main() -> None:
         {
             "map": place,
             "maps": len(found),
-            **{f"{name} ms": f"{np.median([one[name] for one in found]):.1f}" for name in found[0]},
+            **{f"{name} ms": round(float(np.median([one[name] for one in found])), 1) for name in found[0]},
         }
         for place, found in by_place.items()
     ]
-    print(f"{args.tiles} tiles of {TILE_M} m changed; CPU, median\n\n{markdown(rows)}")
+    table = f"{args.tiles} tiles of {TILE_M} m changed; CPU, median\n\n{markdown(rows)}"
+    print(json.dumps({"tiles": args.tiles, "rows": rows}) if args.json else table)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ the features again whenever the map has grown by a tenth.  A PNG is the whole ma
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import sys
 from dataclasses import asdict, dataclass, replace
@@ -30,7 +29,7 @@ from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from protocol.messages import CoarseMap, FineTiles
 from protocol.tiles import TileDelta, TileMap
 from tests.bench.recordings import SHARED
-from tests.bench.tables import markdown
+from tests.bench.tables import markdown, write_json
 
 CELL_M, RANGE_M = 0.05, 25.0
 
@@ -141,9 +140,7 @@ def main() -> int:
         print(f"no recordings at {SHARED}/data: set MAPQUILT_SHARED", file=sys.stderr)
         return 2
     costs = [measure(log, args.every) for log in args.logs]
-    if args.json:
-        args.json.parent.mkdir(parents=True, exist_ok=True)
-        args.json.write_text(json.dumps([asdict(cost) for cost in costs], indent=1) + "\n")
+    write_json(args.json, [asdict(cost) for cost in costs])
     rows = [
         {
             "recording": f"{c.log} ({c.updates} updates)",

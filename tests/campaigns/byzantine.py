@@ -11,7 +11,6 @@ that the honest maps and the honest edges alone give.
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import sys
 from dataclasses import asdict, dataclass
@@ -24,7 +23,7 @@ from agent.merging.fusion import fuse
 from protocol.geometry import SE2
 from protocol.messages import GlobalMap
 from protocol.tiles import TileMap
-from tests.bench.tables import markdown
+from tests.bench.tables import markdown, write_json
 from tests.fleet.attackers import ATTACKS, Liar
 from tests.fleet.explorer import Explorer, random_world
 from tests.fleet.simulation import Fleet, Node
@@ -141,9 +140,7 @@ def main() -> int:
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     verdicts = [run_attack(name, seed) for name in args.attack or ATTACKS for seed in range(args.seeds)]
-    if args.json:
-        args.json.parent.mkdir(parents=True, exist_ok=True)
-        args.json.write_text(json.dumps([asdict(verdict) for verdict in verdicts], indent=1) + "\n")
+    write_json(args.json, [asdict(verdict) for verdict in verdicts])
     names = dict.fromkeys(verdict.attack for verdict in verdicts)
     print(markdown([_row(name, [verdict for verdict in verdicts if verdict.attack == name]) for name in names]))
     return 0 if all(is_good(verdict) for verdict in verdicts) else 1

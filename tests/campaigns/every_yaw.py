@@ -11,6 +11,7 @@ Every map is drawn anew in its frame, with its own noise.  Normalised squared er
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import sys
 import time
@@ -110,14 +111,16 @@ def main() -> int:
     parser.add_argument("--resolution", type=float, default=0.1, metavar="M")
     parser.add_argument("--seed", type=int, default=7, help="of the building")
     parser.add_argument("--kit-stride", type=int, default=0, metavar="N", help="also every N-th fitting pair of the kit")
+    parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     cv2.setNumThreads(1)
     started = time.process_time()
     answers = {f"every {args.step_deg} deg": [answer(pair) for pair in turned_pairs(args.step_deg, args.resolution, args.seed)]}
     if args.kit_stride:
         answers["kit"] = [answer(pair) for pair in kit_pairs("main", "pos", args.kit_stride)]
-    print(markdown([row(name, found) for name, found in answers.items()]))
-    print(f"\nCPU {time.process_time() - started:.0f} s, with drawing the maps")
+    rows, cpu_s = [row(name, found) for name, found in answers.items()], time.process_time() - started
+    table = f"{markdown(rows)}\n\nCPU {cpu_s:.0f} s, with drawing the maps"
+    print(json.dumps({"rows": rows, "CPU s": round(cpu_s)}) if args.json else table)
     turned = next(iter(answers.values()))
     return min(100, sum(not (a.accepted and a.is_right) for a in turned))
 

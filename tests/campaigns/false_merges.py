@@ -79,20 +79,26 @@ def _stored(store: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in whole]
 
 
-def report(results: list[dict[str, Any]]) -> str:
+def figures(results: list[dict[str, Any]]) -> dict[str, Any]:
+    """A row for each kind of pair and one for all, and what everything took."""
     tried, spent, merged = Counter[str](), Counter[str](), Counter[str]()
     for result in results:
         tried.update(result["tried"])
         spent.update(result["spent_s"])
         merged.update(pair["kind"] for pair in result["merged"])
-    total = max(1, tried.total())
+    rows = [row(kind, tried[kind], merged[kind], spent[kind]) for kind in sorted(tried)]
+    rows.append(row("all", tried.total(), merged.total(), sum(spent.values())))
     whole_s = sum(result["all_s"] for result in results)
-    rows = [(kind, tried[kind], f"{merged[kind]}", spent[kind] / tried[kind]) for kind in sorted(tried)]
-    rows.append(("**all**", tried.total(), f"**{merged.total()}**", sum(spent.values()) / total))
-    table = markdown(
-        [{"negative pairs": kind, "tried": n, "merged": m, "CPU ms a match": f"{1e3 * cpu_s:.0f}"} for kind, n, m, cpu_s in rows]
-    )
-    return f"{table}\n\nCPU {whole_s:.0f} s, {1e3 * whole_s / total:.0f} ms a pair with making the maps and their features"
+    return {"rows": rows, "CPU s": round(whole_s), "CPU ms a pair": round(1e3 * whole_s / max(1, tried.total()))}
+
+
+def row(kind: str, tried: int, merged: int, spent_s: float) -> dict[str, Any]:
+    return {"negative pairs": kind, "tried": tried, "merged": merged, "CPU ms a match": round(1e3 * spent_s / max(1, tried))}
+
+
+def table(told: dict[str, Any]) -> str:
+    took = f"CPU {told['CPU s']} s, {told['CPU ms a pair']} ms a pair with making the maps and their features"
+    return f"{markdown(told['rows'])}\n\n{took}"
 
 
 def main() -> int:
@@ -100,6 +106,7 @@ def main() -> int:
     parser.add_argument("--pairs", type=int, default=10_000, help=f"in blocks of {BLOCK} (default 10,000)")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=2, help="processes (default 2)")
+    parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     store = REPO / "out" / "campaigns" / f"false_merges-{args.seed}-{code_hash()}.jsonl"
     store.parent.mkdir(parents=True, exist_ok=True)
@@ -109,7 +116,8 @@ def main() -> int:
         for pair in result["merged"]:
             print(f"MERGED {pair['kind']}: {pair['ours']} with {pair['theirs']} {pair['evidence']}", file=sys.stderr)
         print(f"{len(results)}/{wanted} blocks, {time.monotonic() - started:.0f} s", file=sys.stderr, flush=True)
-    print(report(results))
+    told = figures(results)
+    print(json.dumps(told) if args.json else table(told))
     return min(100, sum(len(result["merged"]) for result in results))
 
 

@@ -10,7 +10,6 @@ command goes on where it was stopped: start another file for other code.
 from __future__ import annotations
 
 import argparse
-import json
 import multiprocessing
 import sys
 import time
@@ -23,7 +22,7 @@ from typing import Any
 
 import cv2
 
-from tests.bench.tables import markdown
+from tests.bench.tables import markdown, write_json
 from tests.fleet.schedules import run_schedule
 from tests.harness.kept import Record, keep, kept
 from tests.harness.processes import percentile
@@ -43,9 +42,7 @@ def main() -> int:
     started_s = time.monotonic()
     records = run(args, range(args.first, args.first + args.schedules))
     figures = {**summary(records), "wall_s": round(time.monotonic() - started_s, 1)}
-    if args.json:
-        args.json.parent.mkdir(parents=True, exist_ok=True)
-        args.json.write_text(json.dumps(figures, indent=1) + "\n")
+    write_json(args.json, figures)
     print(markdown([row(figures)]))
     return 1 if figures["failed"] or figures["converged_s"]["p99"] > BAR_S else 0
 

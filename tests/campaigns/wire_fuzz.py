@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import multiprocessing
 import random
 import resource
@@ -31,7 +30,7 @@ from protocol.codec import HEADER_BYTES, MAGIC, decode, encode
 from protocol.errors import LocalProtocolError, RemoteProtocolError
 from protocol.messages import FineTiles, GlobalTiles
 from protocol.security import unseal
-from tests.bench.tables import markdown
+from tests.bench.tables import markdown, write_json
 from tests.protocol.examples import examples
 
 _NASTY: tuple[Any, ...] = (
@@ -204,9 +203,7 @@ def main() -> int:
         "wall_s": round(time.monotonic() - started_s, 1),
         "escaped": escapes[:20],
     }
-    if args.json:
-        args.json.parent.mkdir(parents=True, exist_ok=True)
-        args.json.write_text(json.dumps(figures, indent=1) + "\n")
+    write_json(args.json, figures)
     for data, trouble in escapes[:5]:
         print(f"{data[:400]}\n{trouble}", file=sys.stderr)
     row = {
