@@ -9,7 +9,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from typing import Any
@@ -21,7 +20,7 @@ from hw.carmen import read_recording
 from hw.sim.devices import SickScanner
 from hw.sim.replay import Replay, ReplayBoard, ReplayScans
 from tests.bench.recordings import SHARED
-from tests.bench.tables import markdown
+from tests.bench.tables import print_row
 from tests.harness import golden
 
 CARMEN_SPEED = 4.0
@@ -48,7 +47,7 @@ def main(argv: list[str] | None = None) -> int:
         golden.DEVICES.write_bytes(golden.written(golden.drive()))
     run = carmen(args.carmen) if args.carmen else golden.read(golden.DEVICES)
     figures, robots = replayed(run, args.particles)
-    print(json.dumps(figures) if args.json else table(figures))
+    print_row(figures, as_json=args.json)
     if args.carmen:
         return 0 if figures["to the bit"] else 1
     if args.make or args.record:
@@ -94,10 +93,6 @@ def replayed(run: golden.Run, particles: int) -> tuple[dict[str, Any], dict[str,
         "to the bit": is_same,
     }
     return figures, robots
-
-
-def table(figures: dict[str, Any]) -> str:
-    return markdown([figures])
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ the checkpoint at the end must be the same to the bit.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 
@@ -22,7 +21,7 @@ from agent.runtime.own_loops import fit_in_own_map
 from hw.readings import Odometry
 from tests.bench import recordings
 from tests.bench.mapping import LOGS, Readings
-from tests.bench.tables import markdown
+from tests.bench.tables import print_rows
 
 Row = dict[str, object]
 
@@ -76,7 +75,7 @@ def main() -> int:
     if not (recordings.SHARED / "data" / "carmen").is_dir():
         sys.exit(f"no recordings in {recordings.SHARED / 'data' / 'carmen'}; set MAPQUILT_SHARED to the folder that holds data/")
     rows = [row(name, args.seed, args.times) for name in args.logs.split(",")]
-    print(json.dumps(rows) if args.json else markdown(rows))
+    print_rows(rows, as_json=args.json)
     return 0 if all(r["same grid"] and r["same trajectory"] and r["same checkpoint"] for r in rows) else 1
 
 

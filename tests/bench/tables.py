@@ -8,8 +8,8 @@ from pathlib import Path
 
 
 def markdown(rows: Sequence[Mapping[str, object]]) -> str:
-    """One line a row, the columns of the first; a row may leave some out."""
-    columns = list(rows[0]) if rows else []
+    """One line a row; a row may leave columns out."""
+    columns = list(dict.fromkeys(name for row in rows for name in row))
     return "\n".join([heading(columns), *(line(row, columns) for row in rows)])
 
 
@@ -25,7 +25,12 @@ def line(row: Mapping[str, object], columns: Sequence[str]) -> str:
 
 def print_row(figures: Mapping[str, object], *, as_json: bool) -> None:
     """One row of Markdown, or one line of JSON."""
-    print(json.dumps(figures) if as_json else markdown([figures]))
+    print_rows([figures], as_json=as_json)
+
+
+def print_rows(rows: Sequence[Mapping[str, object]], *, as_json: bool) -> None:
+    """A Markdown table, or one line of JSON a row."""
+    print("\n".join(map(json.dumps, rows)) if as_json else markdown(rows))
 
 
 def write_json(path: Path | None, figures: object) -> None:

@@ -20,7 +20,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from tests.campaigns.bootstrap import ROOT, Claim, table
+from tests.campaigns.bootstrap import ROOT
+from tests.campaigns.claims import Claim, judged
 
 PACKAGES = "python3,python3-venv,systemd"
 OFFLINE = {
@@ -66,23 +67,34 @@ class Bare:
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options(__doc__)
+    parser.add_argument("--no-test", action="store_true", help="without ./run test, which takes minutes")
+    args = parser.parse_args(argv)
+    with bare_debian(args) as root:
+        claims = list(campaign(Bare(root), is_tested=not args.no_test))
+    return judged(claims, as_json=args.json)
+
+
+def options(doc: str | None) -> argparse.ArgumentParser:
+    """What every campaign in a bare Debian is told."""
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--release", default="bookworm")
     parser.add_argument("--base", type=Path, help="the bare system; made when it is not there")
     parser.add_argument("--wheels", type=Path, help="the packages; fetched when they are not there")
-    parser.add_argument("--no-test", action="store_true", help="without ./run test, which takes minutes")
     parser.add_argument("--json", action="store_true")
-    args = parser.parse_args(argv)
+    return parser
+
+
+@contextlib.contextmanager
+def bare_debian(args: argparse.Namespace) -> Iterator[Path]:
+    """The root folder of a bare Debian with this checkout and the packages in it, gone afterwards."""
     if os.geteuid() != 0 or not shutil.which("debootstrap"):
         print("this needs root and debootstrap: sudo apt-get install debootstrap iproute2", file=sys.stderr)
-        return 3
+        raise SystemExit(3)
     with tempfile.TemporaryDirectory(prefix="bare-") as folder:
         base, wheels = args.base or Path(folder) / "base", args.wheels or Path(folder) / "wheels"
         prepare(base, wheels, args.release)
-        with copied(base, wheels, Path(folder) / "root") as root:
-            claims = list(campaign(Bare(root), is_tested=not args.no_test))
-    print(table(claims, is_json=args.json))
-    return 0 if all(claim.holds for claim in claims) else 1
+        yield copied(base, wheels, Path(folder) / "root")
 
 
 def prepare(base: Path, wheels: Path, release: str) -> None:
@@ -97,13 +109,12 @@ def prepare(base: Path, wheels: Path, release: str) -> None:
         subprocess.run([*fetch, "--dest", wheels, "-r", ROOT / "requirements-dev.lock"], check=True, stdout=sys.stderr)
 
 
-@contextlib.contextmanager
-def copied(base: Path, wheels: Path, root: Path) -> Iterator[Path]:
+def copied(base: Path, wheels: Path, root: Path) -> Path:
     subprocess.run(["cp", "-a", base, root], check=True)
     (root / "etc/hosts").write_text("127.0.0.1 localhost\n::1 localhost\n")  # Debian's installer writes it, debootstrap does not
     shutil.copytree(wheels, root / "wheels")
     subprocess.run(["git", "clone", "-q", str(ROOT), root / "src"], check=True)
-    yield root
+    return root
 
 
 def campaign(bare: Bare, *, is_tested: bool) -> Iterator[Claim]:

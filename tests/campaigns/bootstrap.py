@@ -9,30 +9,18 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import os
 import random
 import signal
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from tests.bench.tables import markdown
+from tests.campaigns.claims import Claim, judged
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-@dataclass(frozen=True)
-class Claim:
-    """One line of the table."""
-
-    claim: str
-    bar: str
-    measured: str
-    holds: bool
 
 
 def main() -> int:
@@ -43,17 +31,7 @@ def main() -> int:
     args = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="mapquilt bootstrap ") as folder:
         claims = list(campaign(Path(folder), args.kills, random.Random(args.seed)))
-    print(table(claims, is_json=args.json))
-    return 0 if all(claim.holds for claim in claims) else 1
-
-
-def table(claims: Sequence[Claim], *, is_json: bool) -> str:
-    """For people, or for programs."""
-    if is_json:
-        return json.dumps([asdict(claim) for claim in claims], indent=1)
-    return markdown(
-        [{"claim": c.claim, "bar": c.bar, "measured": c.measured, "": "holds" if c.holds else "FAILS"} for c in claims]
-    )
+    return judged(claims, as_json=args.json)
 
 
 def campaign(folder: Path, kills: int, rng: random.Random) -> Iterator[Claim]:

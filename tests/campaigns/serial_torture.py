@@ -11,7 +11,6 @@ The standard RPLIDAR scan (0x81) has no checksum: there, wrong beams are counted
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from dataclasses import asdict, dataclass
@@ -20,7 +19,7 @@ import numpy as np
 
 from hw.driver import Driver
 from tests.bench.tables import line, markdown
-from tests.harness.bad_line import KINDS, damaged
+from tests.harness.bad_line import damaged, how, options
 from tests.harness.lidar_streams import STREAMS, Stream, decode, errors_m
 
 TILE_S = 30.0  # the period of an LDROBOT clock, so that it stays true when the tile repeats
@@ -50,18 +49,10 @@ class Tally:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--hours", type=float, default=1.0, help="of robot time for each protocol")
-    parser.add_argument("--share", type=float, default=0.01, help="of bytes damaged: half lost, half altered")
-    parser.add_argument("--kind", choices=KINDS, default="bytes", help="one by one, or in bursts")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", help="protocols, separated by commas")
-    parser.add_argument("--json", action="store_true")
-    args = parser.parse_args()
+    args = options(__doc__, "protocols").parse_args()
     names = args.only.split(",") if args.only else list(STREAMS)
-    how = "one by one" if args.kind == "bytes" else "in bursts"
     if not args.json:
-        print(f"{args.share:.3%} of the bytes lost or altered, {how}\n")
+        print(f"{how(args.share, args.kind)}\n")
     tallies: list[Tally] = []
     for name in names:
         tallies.append(torture(name, args.hours, args.share, args.seed, args.kind))

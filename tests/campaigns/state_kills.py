@@ -28,7 +28,7 @@ from pathlib import Path
 
 from agent.commands.children import AgentProcess, ChildError
 from agent.runtime.state import CorruptState, StateDirectory, pack, unpack
-from tests.bench.tables import markdown
+from tests.bench.tables import print_rows
 from tests.harness.processes import percentile
 
 NAME = "mapper"
@@ -82,13 +82,8 @@ def main(argv: list[str] | None = None) -> int:
         naive = kill_writers(Path(folder) / "naive", args.naive, rng, save_in_place, "naive writer, for comparison")
         agents = kill_agents(Path(folder), args.agents, rng)
     rows = [tally.row() for tally in (whole, naive, agents) if tally.kills]
-    print("\n".join(json.dumps(row) for row in rows) if args.json else table(rows))
+    print_rows(rows, as_json=args.json)
     return 0 if whole.holds and agents.holds else 1
-
-
-def table(rows: list[dict[str, object]]) -> str:
-    columns = dict.fromkeys(name for row in rows for name in row)
-    return markdown([{name: row.get(name, "") for name in columns} for row in rows])
 
 
 # The writer.

@@ -8,19 +8,14 @@ mounts, network, cgroups), its LIDAR is simulated, and nothing of the host is to
 
 from __future__ import annotations
 
-import argparse
 import contextlib
-import os
-import shutil
 import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from tests.campaigns.bare_debian import KEYS, Bare, copied, prepare
-from tests.campaigns.bootstrap import Claim, table
+from tests.campaigns.bare_debian import KEYS, Bare, bare_debian, options
+from tests.campaigns.claims import Claim, judged
 
 SERVICE = "mapquilt@robot-1"
 INSTALL = "/src/deploy/install.sh --wheelhouse /wheels"
@@ -73,25 +68,13 @@ class Booted:
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--release", default="bookworm")
-    parser.add_argument("--base", type=Path, help="the bare system; made when it is not there")
-    parser.add_argument("--wheels", type=Path, help="the packages; fetched when they are not there")
-    parser.add_argument("--json", action="store_true")
-    args = parser.parse_args(argv)
-    if os.geteuid() != 0 or not shutil.which("debootstrap"):
-        print("this needs root and debootstrap: sudo apt-get install debootstrap iproute2", file=sys.stderr)
-        return 3
-    with tempfile.TemporaryDirectory(prefix="booted-") as folder:
-        base, wheels = args.base or Path(folder) / "base", args.wheels or Path(folder) / "wheels"
-        prepare(base, wheels, args.release)
-        with copied(base, wheels, Path(folder) / "root") as root:
-            _, installed = Bare(root).run(f"{INSTALL} && {WITH_KEYS} && {SIMULATED}")
-            with booted(root) as system:
-                claims = [Claim("installed, offline", "exit 0", f"exit {installed.returncode}", not installed.returncode)]
-                claims += story(system)
-    print(table(claims, is_json=args.json))
-    return 0 if all(claim.holds for claim in claims) else 1
+    args = options(__doc__).parse_args(argv)
+    with bare_debian(args) as root:
+        _, installed = Bare(root).run(f"{INSTALL} && {WITH_KEYS} && {SIMULATED}")
+        with booted(root) as system:
+            claims = [Claim("installed, offline", "exit 0", f"exit {installed.returncode}", not installed.returncode)]
+            claims += story(system)
+    return judged(claims, as_json=args.json)
 
 
 @contextlib.contextmanager

@@ -9,7 +9,6 @@ those speeds take it; 5 cm of excess are a teleport.  ros_arduino_bridge has no 
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import time
@@ -22,7 +21,7 @@ from hw import arduino_bridge, create2, kobuki, roboclaw, wheels
 from hw.odometry import BaseProtocol, WheelGeometry
 from hw.wheel_driver import WheelDriver
 from tests.bench.tables import markdown
-from tests.harness.bad_line import KINDS, damaged
+from tests.harness.bad_line import damaged, how, options
 
 FRAMES = (
     16384  # of one tile: 16-bit counters that grow by four or more a frame, and a clock of 20 ms, are then at their start again
@@ -87,17 +86,9 @@ class Tally:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--hours", type=float, default=1.0, help="of robot time for each base")
-    parser.add_argument("--share", type=float, default=0.01, help="of bytes damaged: half lost, half altered")
-    parser.add_argument("--kind", choices=KINDS, default="bytes", help="one by one, or in bursts")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", help="bases, separated by commas")
-    parser.add_argument("--json", action="store_true")
-    args = parser.parse_args()
-    tallies = [
-        torture(name, args.hours, args.share, args.seed, args.kind) for name in (args.only.split(",") if args.only else BASES)
-    ]
+    args = options(__doc__, "bases").parse_args()
+    names = args.only.split(",") if args.only else BASES
+    tallies = [torture(name, args.hours, args.share, args.seed, args.kind) for name in names]
     print(json.dumps([asdict(tally) for tally in tallies], indent=2) if args.json else table(tallies, args.share, args.kind))
     return int(any(tally.teleports for tally in tallies))
 
@@ -161,8 +152,7 @@ def table(tallies: list[Tally], share: float, kind: str) -> str:
         }
         for t in tallies
     ]
-    how = "one by one" if kind == "bytes" else "in bursts"
-    return f"{share:.3%} of the bytes lost or altered, {how}\n\n{markdown(rows)}"
+    return f"{how(share, kind)}\n\n{markdown(rows)}"
 
 
 if __name__ == "__main__":

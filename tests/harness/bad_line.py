@@ -2,11 +2,30 @@
 
 from __future__ import annotations
 
+import argparse
+
 import numpy as np
 from numpy.typing import NDArray
 
 BURST_BYTES = 20.0  # the usual length of a burst, geometrically distributed: a millisecond at 230400 baud
 KINDS = ("bytes", "bursts")
+
+
+def options(doc: str, victims: str) -> argparse.ArgumentParser:
+    """What a campaign on bad lines is told; `victims` are what stands at their ends."""
+    parser = argparse.ArgumentParser(description=doc.split("\n", maxsplit=1)[0])
+    parser.add_argument("--hours", type=float, default=1.0, help=f"of robot time for each of the {victims}")
+    parser.add_argument("--share", type=float, default=0.01, help="of bytes damaged: half lost, half altered")
+    parser.add_argument("--kind", choices=KINDS, default="bytes", help="one by one, or in bursts")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", help=f"{victims}, separated by commas")
+    parser.add_argument("--json", action="store_true")
+    return parser
+
+
+def how(share: float, kind: str) -> str:
+    """What the line did, in words."""
+    return f"{share:.3%} of the bytes lost or altered, {'one by one' if kind == 'bytes' else 'in bursts'}"
 
 
 def damaged(clean: NDArray[np.uint8], kind: str, share: float, rng: np.random.Generator) -> tuple[bytes, int]:
