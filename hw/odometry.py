@@ -12,6 +12,7 @@ import math
 from dataclasses import dataclass
 from typing import Protocol
 
+from hw.framing import Counters
 from hw.readings import Odometry
 from protocol.geometry import SE2
 
@@ -42,7 +43,6 @@ class TickSample:
     counter_bits: int  # width at which the counters wrap
     clock_s: float | None = None  # the board's own clock, wrapping at clock_period_s
     clock_period_s: float = 0.0
-    sequence: int | None = None  # wraps at 256
     is_reset: bool = False  # the board says that it restarted
     is_faulty: bool = False  # the board says that an encoder does not work
 
@@ -53,6 +53,7 @@ class BaseProtocol(Protocol):
     baud_rates: tuple[int, ...]  # likeliest first
     geometry: WheelGeometry  # may change when the board tells its own
     poll_period_s: float  # send `poll_request()` this often; 0: the board streams by itself
+    counters: Counters  # of its frames
 
     def start_requests(self) -> list[bytes]:
         """Sent once after opening, in order."""

@@ -69,6 +69,9 @@ class WheelDriver(DriverBase):
             self._integrator.geometry = self._protocol.geometry
             self.counters.frames += 1
             readings.append(self._integrator.add(sample, self._stamp_s(sample, now_s)))
+        told = self._protocol.counters
+        self.counters.bad_frames, self.counters.skipped_bytes = told.bad_frames, told.skipped_bytes
+        self.counters.resyncs = told.resyncs
         return readings
 
     def _stamp_s(self, sample: TickSample, now_s: float) -> float:

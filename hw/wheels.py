@@ -4,7 +4,7 @@
     encoder   01 seq t_us:u32 left:i32 right:i32 flags crc:u16         little-endian; SERIAL.md 7.8
     info      00 version ticks_per_rev:u16 wheel_radius_um:u32 track_um:u32 name crc:u16
 
-Fifty encoder frames a second are 950 bytes; loss shows in `seq`, a restart in `flags` and in time going back.
+Fifty encoder frames a second are 950 bytes; a lost one costs nothing, a restart shows in `flags` and in time going back.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import binascii
 import struct
 from dataclasses import dataclass, field
 
+from hw.framing import Counters
 from hw.odometry import Quiet, TickSample, WheelGeometry
 
 BAUD_RATES = (115200,)
@@ -40,7 +41,7 @@ class EncoderFrame:
         faulty = bool(self.flags & (FLAG_LEFT_FAULT | FLAG_RIGHT_FAULT))
         boot = bool(self.flags & FLAG_BOOT)
         clock_s = self.clock_us / 1e6
-        return TickSample(self.left_ticks, self.right_ticks, 32, clock_s, CLOCK_PERIOD_S, self.sequence, boot, faulty)
+        return TickSample(self.left_ticks, self.right_ticks, 32, clock_s, CLOCK_PERIOD_S, boot, faulty)
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,9 +128,7 @@ def cobs_decode(wire: bytes) -> bytes | None:
 class WheelDecoder:
     """Bytes in any pieces to frames; bounded, total, counts what it refuses."""
 
-    frames: int = 0
-    bad_frames: int = 0
-    info: InfoFrame | None = None
+    counters: Counters = field(default_factory=Counters)
     _pending: bytearray = field(default_factory=bytearray)
     _is_overlong: bool = False
 
@@ -159,15 +158,11 @@ class WheelDecoder:
             return None  # two delimiters in a row are idle line
         frame = None if was_overlong else decode(wire)
         if frame is None:
-            self.bad_frames += 1
+            self.counters.bad_frames += 1
+            self.counters.skip(len(wire) + 1)
             return None
-        self._count(frame)
+        self.counters.good()
         return frame
-
-    def _count(self, frame: Frame) -> None:
-        self.frames += 1
-        if isinstance(frame, InfoFrame):
-            self.info = frame
 
 
 class WheelBoard(Quiet):
@@ -180,12 +175,13 @@ class WheelBoard(Quiet):
         self._max_speed_mps = max_speed_mps
         self.geometry = geometry or WheelGeometry(0.0001, 0.3, max_speed_mps)
         self.is_geometry_known = self._is_given
-        self.decoder = WheelDecoder()
+        self._decoder = WheelDecoder()
+        self.counters = self._decoder.counters
 
     def feed(self, data: bytes) -> list[TickSample]:
         """Samples from the first moment at which a tick's worth is known."""
         samples = []
-        for frame in self.decoder.feed(data):
+        for frame in self._decoder.feed(data):
             if isinstance(frame, InfoFrame):
                 self._learn(frame)
             elif self.is_geometry_known:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from hw import create2, kobuki
 from hw.device import build_driver
 from hw.readings import Odometry
 from hw.supervisor import Device
@@ -83,3 +84,17 @@ def test_a_base_that_only_answers_is_asked_from_the_first_moment() -> None:
         assert samples[-1].x_m > samples[1].x_m
     finally:
         device.stop()
+
+
+@pytest.mark.parametrize(("url", "frame"), [
+    (URL, _frame(1, 0)),
+    ("create2:/dev/ttyUSB0", create2.encode_stream({43: 1, 44: 2})),
+    ("kobuki:/dev/ttyUSB0", kobuki.encode(kobuki.Core(7, 1, 2).encode())),
+])  # fmt: skip
+def test_a_damaged_frame_is_told(url: str, frame: bytes) -> None:
+    driver = build_driver(parse_url(url), "wheels")
+    damaged = frame[:4] + bytes((frame[4] ^ 0x20,)) + frame[5:]
+    assert len(_odometry(driver, frame + damaged + frame, 10.0)) == 2
+    counters = driver.counters
+    assert (counters.frames, counters.bad_frames, counters.skipped_bytes, counters.resyncs) == (2, 1, len(frame), 1)
+    assert counters.bytes_in == 3 * len(frame)
