@@ -20,8 +20,6 @@ from typing import Any, get_type_hints
 Scalar = str | int | float | bool
 Value = Scalar | tuple[str, ...]
 
-ROBOT_ID = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")  # becomes part of Zenoh keys and of file names
-
 
 class ConfigError(Exception):
     """A setting that cannot be used: says where it was written, what was seen, and what to write instead."""

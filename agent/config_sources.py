@@ -19,7 +19,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from agent.config import ROBOT_ID, Config, ConfigError, Key, Value, default_robot_id, keys, sections
+from agent.config import Config, ConfigError, Key, Value, default_robot_id, keys, sections
+from protocol.names import is_robot_id
 
 PREFIX = "MAPQUILT_"
 NOT_SETTINGS = {"MAPQUILT_CONFIG", "MAPQUILT_SHARED"}  # ours as well, but no settings of a robot
@@ -66,7 +67,7 @@ def checked(where: str, name: str, value: Any) -> Value:
         raise ConfigError(f"{where}: unknown key '{name}'{_suggestion(name)}")
     result = _typed(where, key, value)
     _check_range(where, key, result)
-    if name == "robot.id" and result and not ROBOT_ID.fullmatch(str(result)):
+    if name == "robot.id" and result and not is_robot_id(str(result)):
         raise ConfigError(f"{where}: robot.id = {value!r}: use 1 to 32 of a-z, 0-9, '-' and '_', first a letter or digit")
     return result
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 from protocol import messages as m
 from protocol.errors import LocalProtocolError, RemoteProtocolError
+from protocol.names import is_robot_id
 
 MAJOR_VERSION = 1
 MAX_PUSH_BYTES = 16_384  # one batch of the network: larger puts are lost whole on slow links
@@ -95,7 +96,7 @@ def push_register(message: m.Message) -> str:
 def parse_key(key: str) -> tuple[str, str, str]:
     """(fleet, robot, register) of a key a peer wrote on."""
     match = _KEY.fullmatch(key)
-    if match is None or int(match[1]) != MAJOR_VERSION or not m.is_robot_id(match[2]) or not m.is_robot_id(match[3]):
+    if match is None or int(match[1]) != MAJOR_VERSION or not is_robot_id(match[2]) or not is_robot_id(match[3]):
         raise RemoteProtocolError(f"key '{key[:120]}' is not mapquilt/@v{MAJOR_VERSION}/<fleet>/r/<robot>/...")
     return match[2], match[3], match[4]
 
@@ -118,6 +119,6 @@ def _hex(digest: bytes) -> str:
 
 
 def _name(text: str) -> str:
-    if not m.is_robot_id(text):
+    if not is_robot_id(text):
         raise LocalProtocolError(f"'{text[:80]}' is no name for a robot or fleet; use 1 to 32 of a-z 0-9 _ - (first a-z 0-9)")
     return text

@@ -16,7 +16,7 @@ from typing import Any
 
 from protocol.errors import RemoteProtocolError, TooLarge
 from protocol.geometry import SE2, wrap_angle
-from protocol.messages import is_robot_id
+from protocol.names import is_robot_id
 
 MAX_COORDINATE_M = 1e6
 

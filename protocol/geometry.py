@@ -24,11 +24,6 @@ def wrap_angles(angles_rad: ArrayLike) -> NDArray[np.float64]:
     return (np.asarray(angles_rad, dtype=np.float64) + math.pi) % math.tau - math.pi
 
 
-def undirected_angle_rad(a_rad: float, b_rad: float) -> float:
-    """Smallest angle between two lines without direction, in [0, pi/2]."""
-    return abs(math.remainder(a_rad - b_rad, math.pi))
-
-
 @dataclass(frozen=True, slots=True)
 class SE2:
     """A rigid motion of the plane; as a pose, where one frame sits in another."""
@@ -72,6 +67,3 @@ class SE2:
     def distance_m(self, other: SE2) -> float:
         """Distance between the two origins."""
         return math.hypot(self.x_m - other.x_m, self.y_m - other.y_m)
-
-
-Pose2D = SE2

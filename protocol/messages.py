@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import enum
 import hashlib
-import re
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -25,16 +24,9 @@ from protocol.geometry import SE2
 from protocol.grid import OccupancyGrid
 from protocol.tiles import TileDelta
 
-ROBOT_ID = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
-"""A robot's name: one chunk of a key expression, one CN of a certificate, one label on a screen."""
-
 NO_DIGEST = b""  # "nothing yet", wherever a digest is optional
 
 Symmetric3 = tuple[float, float, float, float, float, float]  # xx, xy, xt, yy, yt, tt of a 3x3 covariance (m, m, rad)
-
-
-def is_robot_id(text: str) -> bool:
-    return ROBOT_ID.fullmatch(text) is not None
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ from collections import OrderedDict
 from dataclasses import dataclass
 
 from protocol.errors import LocalProtocolError, RemoteProtocolError
-from protocol.messages import is_robot_id
+from protocol.names import is_robot_id
 
 MAGIC = b"MS\x01"
 SEAL_BYTES = 68  # at most, around any payload

@@ -21,7 +21,7 @@ from typing import Any
 
 from agent.exits import BAD_INPUT, ENVIRONMENT, OK, USAGE, CommandError
 from protocol.channels import fleet_key, robot_key
-from protocol.messages import is_robot_id
+from protocol.names import is_robot_id
 
 EXAMPLES = """\
   mapquilt fleet init keys --fleet warehouse      once, on the operator's laptop

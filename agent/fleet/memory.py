@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from protocol.geometry import SE2
-from protocol.messages import is_robot_id
+from protocol.names import is_robot_id
 
 _MAX_PEERS = 256
 

@@ -13,14 +13,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from protocol.names import is_robot_id
+
 PROFILES = ("loopback", "lan", "radio", "infrastructure")
 SECURITY_LEVELS = ("open", "shared", "mtls")
-NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")  # a robot or fleet id: spaces and `*` are legal in Zenoh keys, never in ours
 
 MAX_MESSAGE_BYTES = 2 * 1024 * 1024  # a 200 MB message costs +4 MB here, +344 MB at Zenoh's default
 INTERESTS_TIMEOUT_MS = 60_000  # at the default 10 s, 2 of 3 meshes of 100 peers lost declarations for good
@@ -49,7 +49,7 @@ class NetworkSettings:
     def checked(self) -> NetworkSettings:
         """These settings, or the one sentence that says why they cannot work."""
         for what, name in (("robot id", self.robot), ("fleet name", self.fleet)):
-            if not NAME.fullmatch(name):
+            if not is_robot_id(name):  # spaces and `*` are legal in Zenoh keys, never in ours
                 raise NetworkConfigError(
                     f"{what} {name!r}: use 1 to 32 of a-z, 0-9, '-' and '_', starting with a letter or digit"
                 )

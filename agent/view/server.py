@@ -33,12 +33,13 @@ from agent.view.page_facts import features_json, page_facts
 from agent.view.render import grid_png
 from protocol.features import FeatureMap
 from protocol.grid import OccupancyGrid
+from protocol.names import ROBOT_ID
 
 log = logging.getLogger(__name__)
 
 MAX_CLIENTS = 32
 REQUEST_TIMEOUT_S = 5.0  # a client that sends its request slowly is hung up on
-NAME = "([a-z0-9][a-z0-9_-]{0,31})"
+NAME = f"({ROBOT_ID.pattern})"
 MAP_PATH, FEATURES_PATH = re.compile(rf"/map/{NAME}\.png"), re.compile(rf"/features/{NAME}\.json")
 
 

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from agent.config import ROBOT_ID, Config, ConfigError, control_socket, default_robot_id, keys, state_dir
+from agent.config import Config, ConfigError, control_socket, default_robot_id, keys, state_dir
 from agent.config_sources import assignment, load_config
+from protocol.names import is_robot_id
 
 
 @pytest.fixture
@@ -46,7 +47,7 @@ def test_every_default_is_a_value_that_may_be_written(home: dict[str, str]) -> N
 def test_the_id_of_any_host_can_stand_in_a_key(monkeypatch: pytest.MonkeyPatch) -> None:
     for host in ("Robot_7.lan", "-", "", "été", "x" * 64, "a b/*$#"):
         monkeypatch.setattr("socket.gethostname", lambda host=host: host)
-        assert ROBOT_ID.fullmatch(default_robot_id()), host
+        assert is_robot_id(default_robot_id()), host
 
 
 def test_an_installed_robot_reads_the_file_of_the_system(home: dict[str, str], tmp_path: Path) -> None:
