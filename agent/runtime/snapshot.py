@@ -10,7 +10,8 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from agent.fleet.state import FleetState
-from hw.device import DeviceState, Source
+from agent.runtime.problems import problems
+from hw.device import Source
 from protocol.geometry import SE2
 from protocol.grid import OccupancyGrid
 
@@ -27,7 +28,6 @@ def plain_pose(pose: SE2) -> list[float]:
 def snapshot(node: Node) -> dict[str, Any]:
     """Everything there is to say, in JSON values."""
     fleet = node.fleet.state()
-    estimate, global_map = node.map.newest, node.fleet.global_map
     frames = {robot: plain_pose(frame.T_global_map) for robot, frame in fleet.frames.items()}
     frames.setdefault(node.robot, [0.0, 0.0, 0.0])
     return {
@@ -46,44 +46,15 @@ def snapshot(node: Node) -> dict[str, Any]:
         "poses": poses(node, fleet),
         "odometry": odometry(node),
         "peers": peers(fleet),
-        "edges": [
-            {
-                "a": e.robot_a,
-                "b": e.robot_b,
-                "match_factor": round(e.match_factor, 4),
-                "T_a_b": plain_pose(e.T_a_b),
-                "is_used": e not in fleet.rejected_edges,
-                "age_s": node.records.edge_age_s(e.robot_a, e.robot_b),
-            }
-            for e in fleet.edges
-        ],
+        "edges": edges(node, fleet),
         "merge_times": node.records.merge_times(),
-        "global": None
-        if global_map is None
-        else {
-            "digest": global_map.digest.hex(),
-            "author": global_map.author,
-            "members": [member.robot for member in global_map.members],
-            "known_m2": round(global_map.grid.known_area_m2(), 2),
-            "conflicting_cells": global_map.conflicting_cells,
-            "agreeing_cells": global_map.agreeing_cells,
-        },
+        "global": global_facts(node),
         "maps": maps(node),
         "attempts": node.records.of("merge-attempt"),
         "network": network(node),
-        "workers": [
-            {
-                "name": r.name,
-                "idle_s": round(r.idle_s, 1),
-                "steps": r.steps,
-                "errors": r.errors,
-                "error": r.last_error,
-                "stuck": r.is_stuck,
-            }
-            for r in node.reports()
-        ],
+        "workers": workers(node),
         "problems": problems(node, fleet),
-        "has_estimate": estimate is not None,
+        "has_estimate": node.map.newest is not None,
     }
 
 
@@ -171,6 +142,34 @@ def peers(fleet: FleetState) -> list[dict[str, Any]]:
     ]
 
 
+def edges(node: Node, fleet: FleetState) -> list[dict[str, Any]]:
+    return [
+        {
+            "a": e.robot_a,
+            "b": e.robot_b,
+            "match_factor": round(e.match_factor, 4),
+            "T_a_b": plain_pose(e.T_a_b),
+            "is_used": e not in fleet.rejected_edges,
+            "age_s": node.records.edge_age_s(e.robot_a, e.robot_b),
+        }
+        for e in fleet.edges
+    ]
+
+
+def global_facts(node: Node) -> dict[str, Any] | None:
+    global_map = node.fleet.global_map
+    if global_map is None:
+        return None
+    return {
+        "digest": global_map.digest.hex(),
+        "author": global_map.author,
+        "members": [member.robot for member in global_map.members],
+        "known_m2": round(global_map.grid.known_area_m2(), 2),
+        "conflicting_cells": global_map.conflicting_cells,
+        "agreeing_cells": global_map.agreeing_cells,
+    }
+
+
 def maps(node: Node) -> dict[str, dict[str, Any]]:
     found = {name: found for name in [GLOBAL, node.robot, *node.fleet.peer_maps] if (found := grid_of(node, name)) is not None}
     return {
@@ -211,24 +210,15 @@ def network(node: Node) -> dict[str, Any]:
     }
 
 
-def problems(node: Node, fleet: FleetState) -> list[str]:
-    """What a person should know, one sentence each; empty when all is well."""
-    said = [
-        d["error"] or f"{d['name']} {d['url']}: {d['state']}" for d in devices(node) if d["state"] != DeviceState.RUNNING.value
+def workers(node: Node) -> list[dict[str, Any]]:
+    return [
+        {
+            "name": r.name,
+            "idle_s": round(r.idle_s, 1),
+            "steps": r.steps,
+            "errors": r.errors,
+            "error": r.last_error,
+            "stuck": r.is_stuck,
+        }
+        for r in node.reports()
     ]
-    if not node.fleet.exchange.is_open:
-        said.append(f"no network: no router answers at {', '.join(node.config.fleet.connect)}; this robot maps on its own")
-    if fleet.is_twin:
-        said.append(f"another robot calls itself {node.robot}: this one, the younger, stays silent; give it another --id")
-    if node.map.is_paused:
-        said.append("mapping is paused: mapquilt resume")
-    if node.readings.scans_lost > 0.01 * max(100, node.readings.scans_in):
-        lost, came = node.readings.scans_lost, node.readings.scans_in
-        said.append(f"{lost} of {came} scans lost: this computer is too slow, lower mapping.particles")
-    said += [f"worker {name} makes no progress" for name in node.health.stuck]
-    said += [f"worker {r.name} fails: {r.last_error}; please report this with the log" for r in node.reports() if r.is_failing]
-    if node.state is not None and node.state.last_error:
-        said.append(f"state: {node.state.last_error}; mapping goes on in memory")
-    if node.records.last_error:
-        said.append(f"records cannot be written: {node.records.last_error}; the newest are kept in memory")
-    return said

@@ -15,7 +15,8 @@ import numpy as np
 from agent.commands.report import RECORD_FILES, read_records
 from agent.config import Config, LidarConfig, MappingConfig, RobotConfig
 from agent.fleet.effects import Note
-from agent.runtime import records, snapshot
+from agent.runtime import problems as told
+from agent.runtime import records
 from agent.runtime.node import Node
 from agent.runtime.state import StateDirectory
 from hw.readings import LaserScan
@@ -87,7 +88,7 @@ def _map_and_save(node: Node, second: int) -> bytes:
 
 def problems(node: Node) -> list[str]:
     """What the robot says of its disk."""
-    said = snapshot.problems(node, node.fleet.state())
+    said = told.problems(node, node.fleet.state())
     return [problem for problem in said if problem.startswith(("state", "records"))]
 
 
