@@ -29,6 +29,7 @@ from agent.mapping.scan_matching import UNCONSTRAINED_RATIO
 from agent.mapping.scan_points import ScanPoints, laser_position_m, reference_stamp_s, scan_points
 from agent.mapping.tracking import GOOD_FRACTION, SURE_FRACTION, Tracked
 from hw.readings import LaserScan, Odometry
+from protocol.geometry import wrap_angle
 from protocol.grid import OccupancyGrid
 
 FEWEST_POINTS = 20  # fewer returns than this say nothing about where the robot is
@@ -37,6 +38,7 @@ CONTRADICTED = 0.35  # share of a scan that the map rules out; a crowd of people
 LOST_AFTER = 5  # scans in a row that contradict the map before the robot looks for itself elsewhere
 CONFIRMED_AFTER = 5  # scans in a row that fit, after it found itself, before it draws again
 NEW_MAP_AFTER_S = 10.0  # of looking everywhere in vain
+SKEWED_RAD = math.radians(3.0)  # of a revolution: a wheel spun, and the scan is a spiral; it is followed, not drawn
 STUCK_AFTER = 3  # identical scans in a row, while the wheels turn
 STUCK_MOVED_M = 0.05
 STUCK_TURNED_RAD = 0.05
@@ -72,7 +74,8 @@ class Mapper:
     def add_scan(self, scan: LaserScan) -> ScanOutcome:
         """Track one scan, and draw it when it is a keyframe."""
         points = scan_points(scan, self.odometry, self.options)
-        if self._is_stuck(scan):
+        is_stuck = self._is_stuck(scan)
+        if is_stuck and points.n > 0:  # scans of a place too wide to see anything are alike, too
             return self._held(
                 points, MapperStatus.STUCK, 0.0, "the LIDAR repeats one scan while the wheels turn: unplug and replug it"
             )
@@ -94,8 +97,9 @@ class Mapper:
         if not self._is_believable(points, tracked):
             return self._contradicted(points, tracked)
         self.contradictions = 0
+        skew_rad = self._skew_rad(points, motion, tracked)
         self.map.note_motion(motion)
-        self.confirmations_missing = max(self.confirmations_missing - 1, 0)
+        self.confirmations_missing = max(self.confirmations_missing - 1, int(skew_rad > SKEWED_RAD))
         is_keyframe = self.confirmations_missing == 0 and self.map.is_keyframe(points.stamp_s, tracked.pose)
         if is_keyframe:
             self.map.update(points, tracked.pose)
@@ -104,7 +108,17 @@ class Mapper:
         self.loops_closed += loop is not None
         is_open = tracked.weakest < UNCONSTRAINED_RATIO
         status = MapperStatus.UNCONSTRAINED if is_open else MapperStatus.TRACKING
-        return replace(self._outcome(status, is_keyframe, tracked.fraction), loop=loop)
+        reason = f"the wheels slip: this scan is twisted by {math.degrees(skew_rad):.0f} degrees" if skew_rad > SKEWED_RAD else ""
+        return replace(self._outcome(status, is_keyframe, tracked.fraction, reason), loop=loop)
+
+    def _skew_rad(self, points: ScanPoints, motion: Motion, tracked: Tracked) -> float:
+        """How far the last beam of a revolution is turned against the first: the wheels, by which its motion was undone, turned
+        otherwise than the robot."""
+        seconds = points.stamp_s - self.map.last_scan_s
+        if not motion.is_known or seconds <= 0.0:
+            return 0.0
+        slipped_rad = abs(wrap_angle(float(tracked.pose[2] - self.map.predicted(motion)[2])))
+        return slipped_rad * min(points.revolution_s / seconds, 1.0)
 
     def _is_believable(self, points: ScanPoints, tracked: Tracked) -> bool:
         """A good fit where the robot can be, a very good one where its wheels say it cannot (they slip, but a LIDAR that tilts

@@ -38,6 +38,7 @@ class ScanPoints:
     surfels: NDArray[np.float32]  # (M, 4) hits to match, one a voxel: x, y, and the unit normal there, (0, 0) where unknown
     surface_m: NDArray[np.float32]  # (K, 2) hits and the surfaces between neighbouring ones, one a voxel
     is_partial: bool
+    revolution_s: float  # from its first beam to its last
 
     @property
     def n(self) -> int:
@@ -71,7 +72,13 @@ def scan_points(scan: LaserScan, track: OdometryTrack, options: MappingOptions) 
     ends = points.astype(np.float32)
     hits = one_per_voxel(ends[is_hit])
     return ScanPoints(
-        stamp_s, ends, is_hit, thinned(with_normals(hits), MOST_SURFELS), surface_points(ends, is_hit, cut), scan.is_partial
+        stamp_s,
+        ends,
+        is_hit,
+        thinned(with_normals(hits), MOST_SURFELS),
+        surface_points(ends, is_hit, cut),
+        scan.is_partial,
+        scan.duration_s,
     )
 
 

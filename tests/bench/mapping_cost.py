@@ -16,20 +16,22 @@ import cv2
 
 from agent.mapping.mapper import Mapper
 from agent.mapping.options import MappingOptions
-from tests.bench.mapping_worlds import BEAMS, MAX_RANGE_M, SCAN_HZ, explore, feed, world_of
+from tests.bench.mapping_drives import Conditions, explore, world_of
+from tests.bench.mapping_worlds import feed
 from tests.bench.tables import markdown
 
-PARTICLES = 30
+USUAL, PARTICLES = Conditions(), 30
 STRETCHES = 5
 Row = dict[str, object]
 
 
 def cost(world: str, seed: int, minutes: float, beams: int, scan_hz: float, particles: int, stretches: int = 1) -> list[Row]:
     """One run, cut into stretches of equal length: a row each."""
-    mapper = Mapper(MappingOptions(particles=particles, matching_range_m=MAX_RANGE_M), seed)
+    mapper = Mapper(MappingOptions(particles=particles, matching_range_m=USUAL.range_m), seed)
     per_stretch = max(1, int(minutes * 60 * scan_hz / stretches))
     rows, cpu_s = [], 0.0
-    for number, revolution in enumerate(explore(world_of(world, seed), seed, minutes, beams, scan_hz), start=1):
+    conditions = Conditions(beams=beams, scan_hz=scan_hz)
+    for number, revolution in enumerate(explore(world_of(world, seed), seed, minutes, conditions), start=1):
         cpu_s += feed(mapper, revolution)[1]
         if number % per_stretch == 0:
             rows.append(_row(mapper, beams, scan_hz, particles, cpu_s / per_stretch))
@@ -52,12 +54,12 @@ def _row(mapper: Mapper, beams: int, scan_hz: float, particles: int, cpu_s: floa
 def table(world: str, seed: int, minutes: float) -> list[Row]:
     rows = []
     for beams in (180, 360, 720, 1440):
-        rows += cost(world, seed, minutes, beams, SCAN_HZ, PARTICLES)
+        rows += cost(world, seed, minutes, beams, USUAL.scan_hz, PARTICLES)
     for scan_hz in (5.0, 20.0):
-        rows += cost(world, seed, minutes, BEAMS, scan_hz, PARTICLES)
+        rows += cost(world, seed, minutes, USUAL.beams, scan_hz, PARTICLES)
     for particles in (10, 100):
-        rows += cost(world, seed, minutes, BEAMS, SCAN_HZ, particles)
-    return rows + cost(world, seed, 5 * minutes, BEAMS, SCAN_HZ, PARTICLES, STRETCHES)
+        rows += cost(world, seed, minutes, USUAL.beams, USUAL.scan_hz, particles)
+    return rows + cost(world, seed, 5 * minutes, USUAL.beams, USUAL.scan_hz, PARTICLES, STRETCHES)
 
 
 def main() -> None:

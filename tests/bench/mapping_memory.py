@@ -19,7 +19,8 @@ import numpy as np
 from agent.mapping.mapper import Mapper
 from agent.mapping.options import MappingOptions
 from agent.runtime.own_loops import fit_in_own_map
-from tests.bench.mapping_worlds import MAX_RANGE_M, explore, feed, world_of
+from tests.bench.mapping_drives import Conditions, explore, world_of
+from tests.bench.mapping_worlds import feed
 from tests.bench.tables import markdown
 from tests.campaigns.soak import slope_per_hour
 
@@ -88,9 +89,10 @@ def main() -> int:
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     cv2.setNumThreads(1)
-    mapper = Mapper(MappingOptions(matching_range_m=MAX_RANGE_M), args.seed, fit_in_own_map)
+    conditions = Conditions(scan_hz=args.scan_hz)
+    mapper = Mapper(MappingOptions(matching_range_m=conditions.range_m), args.seed, fit_in_own_map)
     rows: list[Row] = []
-    revolutions = explore(world_of(args.world, args.seed), args.seed, 60 * args.hours, scan_hz=args.scan_hz)
+    revolutions = explore(world_of(args.world, args.seed), args.seed, 60 * args.hours, conditions)
     for number, revolution in enumerate(revolutions, start=1):
         feed(mapper, revolution)
         if number % round(STRETCH_S * args.scan_hz) == 0:

@@ -171,6 +171,35 @@ def test_a_blind_lidar_draws_nothing(drive: Drive) -> None:
     assert drive.mapper.estimate().revision == revision
 
 
+def test_a_place_too_wide_to_see_anything_is_no_fault_of_the_lidar(drive: Drive) -> None:
+    drive.steps(20)
+    statuses = []
+    for _ in range(20):
+        drive.mapper.add_odometry(drive.odometry())
+        scan = drive.scan()
+        statuses.append(drive.mapper.add_scan(replace(scan, ranges_m=np.full_like(scan.ranges_m, np.inf))).status)
+        drive.at += 1
+    assert set(statuses) == {MapperStatus.BLIND}
+
+
+def test_a_scan_that_was_twisted_by_slipping_wheels_is_followed_and_not_drawn(drive: Drive) -> None:
+    drive.steps(30)
+    revision, start = drive.mapper.estimate().revision, drive.true
+    for _ in range(8):
+        drive.wheels.pose = drive.wheels.pose @ SE2(0.0, 0.0, 0.3)
+        drive.mapper.add_odometry(drive.odometry())
+        turning = replace(drive.scan(), stamp_s=drive.now_s - 0.1, duration_s=0.2)
+        outcome = drive.mapper.add_scan(turning)
+        assert "slip" in outcome.reason
+        drive.at += 1
+    moved = start.inverse() @ drive.true
+    assert math.hypot(moved.x_m, moved.y_m) > 2 * OPTIONS.keyframe_distance_m
+    assert drive.mapper.estimate().revision == revision
+    drive.steps(5)
+    assert drive.mapper.estimate().revision > revision
+    assert drive.error_m() < 0.06
+
+
 def test_invalid_beams_and_changing_scan_lengths_are_ordinary(drive: Drive) -> None:
     drive.steps(10)
     for k in range(60):
