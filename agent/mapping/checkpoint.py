@@ -1,18 +1,14 @@
-"""A mapper as bytes, and back: what the future of the map depends on, nothing else.
-
-    magic "MQMC" | version u16 | sha256 of the rest | zlib( length u32 | JSON: scalars and array shapes | arrays, raw )
+"""A mapper as bytes, and back: what the future of the map depends on, nothing else; how it is written, `state_block` says.
 
 The drawing in progress is not stored: it is drawn again from the stored scans, to the same cell.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 import struct
 import zlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,34 +20,16 @@ from agent.mapping.log_odds import LogOddsGrid
 from agent.mapping.loop_closure import LoopCloser
 from agent.mapping.path_graph import LoopEdge
 from agent.mapping.redrawing import Drawing
+from agent.mapping.state_block import CheckpointError, State, opened, sealed
 from protocol.geometry import SE2
 
 if TYPE_CHECKING:
     from agent.mapping.mapper import Mapper
 
-MAGIC = b"MQMC"
-VERSION = 3
-LARGEST_BYTES = 1 << 30  # unpacked; a map of a square kilometre stays below
-DTYPES = {"bool", "uint8", "uint16", "int8", "int16", "int32", "int64", "float32", "float64"}
-
-State = dict[str, Any]
-
-
-class CheckpointError(ValueError):
-    """These bytes are not a checkpoint that these options can go on from."""
-
 
 def pack(mapper: Mapper) -> bytes:
     """One self-checking block."""
-    arrays = state_of(mapper)
-    scalars = {key: value for key, value in arrays.items() if not isinstance(value, np.ndarray)}
-    arrays = {key: value for key, value in arrays.items() if isinstance(value, np.ndarray)}
-    shapes = [[key, str(value.dtype), list(value.shape)] for key, value in arrays.items()]
-    head = json.dumps({"scalars": scalars, "arrays": shapes}).encode()
-    body = zlib.compress(
-        b"".join([struct.pack("<I", len(head)), head, *(np.ascontiguousarray(a).tobytes() for a in arrays.values())]), 1
-    )
-    return MAGIC + struct.pack("<H", VERSION) + hashlib.sha256(body).digest() + body
+    return sealed(state_of(mapper))
 
 
 def unpack(data: bytes, mapper: Mapper) -> None:
@@ -62,29 +40,6 @@ def unpack(data: bytes, mapper: Mapper) -> None:
         raise
     except (ValueError, KeyError, TypeError, IndexError, struct.error, zlib.error, RecursionError, OverflowError) as error:
         raise CheckpointError(f"the saved map is damaged: {error}") from error
-
-
-def opened(data: bytes) -> State:
-    """Scalars and arrays by name."""
-    if data[:4] != MAGIC:
-        raise CheckpointError("the saved map does not begin like one")
-    (version,) = struct.unpack("<H", data[4:6])
-    if version != VERSION:
-        raise CheckpointError(f"the saved map has format {version}, this program reads {VERSION}")
-    if hashlib.sha256(data[38:]).digest() != data[6:38]:
-        raise CheckpointError("the saved map is damaged: its checksum is wrong")
-    unpacked = zlib.decompressobj().decompress(data[38:], LARGEST_BYTES)
-    (length,) = struct.unpack("<I", unpacked[:4])
-    head = json.loads(unpacked[4 : 4 + length])
-    state: State = dict(head["scalars"])
-    at = 4 + length
-    for key, dtype, shape in head["arrays"]:
-        if dtype not in DTYPES or any(not 0 <= n < LARGEST_BYTES for n in shape):
-            raise CheckpointError(f"the saved map is damaged: array {key!r} of {dtype} {shape}")
-        count = math.prod(shape)
-        state[key] = np.frombuffer(unpacked, dtype, count, at).reshape(shape).copy()
-        at += state[key].nbytes
-    return state
 
 
 def state_of(mapper: Mapper) -> State:

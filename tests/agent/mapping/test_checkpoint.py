@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from agent.mapping import particle_filter
-from agent.mapping.checkpoint import CheckpointError
 from agent.mapping.mapper import Mapper
 from agent.mapping.options import MappingOptions
+from agent.mapping.state_block import CheckpointError
 from hw.readings import LaserScan, Odometry
 from tests.agent.mapping.worlds import ROOMS, DriftingOdometry, rounds, scan_at
 
