@@ -2,6 +2,8 @@
 
 Newer cells that do are held back, and its last agreed version stays in the global map: with one witness until the edge is
 verified on them, with two until they no longer contradict.  A map that denies itself is a lie, and its robot is no longer heard.
+No composer's recipe may use cells held back here, if two witnesses speak against them or our own map was compared with them: of
+one doubt at second hand nothing follows, or large groups of noisy maps would never agree.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from agent.fleet.members import Peer
 from agent.fleet.pairs import PairWork
 from protocol.geometry import SE2
 from protocol.grid import OccupancyGrid
+from protocol.messages import Stance
 
 _REDRAWN = 0.15  # share of walls elsewhere: a new drawing, which is taken as its word from then on
 
@@ -103,7 +106,7 @@ class Admission:
         if peer.held_back_s is None:
             peer.held_back_s = now_s
             self._ledger.note("held-back", is_warning=True, peer=peer.robot, witnesses=witnesses)
-        if peer.held.digest not in peer.refused:
+        if (witnesses >= 2 or self._has_compared(peer)) and peer.held.digest not in peer.refused:
             peer.refused.append(peer.held.digest)
         self._pairs.words.pair(peer.robot).is_urgent = self._is_neighbour(peer)
         self._drop_misplaced(peer, T_ours_theirs)
@@ -119,6 +122,11 @@ class Admission:
 
     def _is_neighbour(self, peer: Peer) -> bool:
         return pair_key(self._ledger.robot, peer.robot) in self._ledger.live
+
+    def _has_compared(self, peer: Peer) -> bool:
+        """Whether our own maps have told about it: by an edge that lives, or by one that we took back."""
+        said = self._ledger.mine.get(peer.robot)
+        return self._is_neighbour(peer) or (said is not None and said.stance is Stance.WITHDRAW)
 
     def _is_checked(self, peer: Peer) -> bool:
         """Whether our own edge with it was found good on these very maps."""

@@ -1,8 +1,7 @@
 """Whether a composer's recipe is followed: it must say what our own edges say, and use no cells that we hold back.
 
-Holding back is a judgement about noisy maps, and each robot makes it on what it happened to see first.  It counts against a
-recipe only among those who compared their maps, neighbours, whose next check of their edge settles it, and who were until
-newer cells spoke against it; and alone against many that follow the recipe it yields, so that one group ends with one map.
+Holding back is a judgement about noisy maps, and each robot makes it on what it happened to see first.  Alone against many that
+follow the recipe it yields, so that one group ends with one map.
 """
 
 from __future__ import annotations
@@ -10,10 +9,10 @@ from __future__ import annotations
 import math
 
 from agent.fleet.frame_graph import Group
-from agent.fleet.ledger import Ledger, pair_key
+from agent.fleet.ledger import Ledger
 from agent.fleet.state import Presence
 from protocol.geometry import wrap_angle
-from protocol.messages import GlobalMeta, Stance
+from protocol.messages import GlobalMeta
 
 _FOLLOW_M, _FOLLOW_RAD = 0.4, 0.06  # how far a composer's layout may be from ours and still be followed
 _OUTVOTED_BY = 1 / 3  # of all who neither wrote the recipe nor are refused in it: more than any few liars are
@@ -35,17 +34,11 @@ def objection(ledger: Ledger, meta: GlobalMeta, group: Group) -> str:
         if T.distance_m(ours) > _FOLLOW_M or abs(wrap_angle(T.theta_rad - ours.theta_rad)) > _FOLLOW_RAD:
             return f"{member.robot} lies {T.distance_m(ours):.2f} m from where our edges put it"
         peer = ledger.peers.get(member.robot)
-        if peer is not None and member.map.digest in peer.refused and _has_compared(ledger, member.robot):
+        if peer is not None and member.map.digest in peer.refused:
             refused.add(member.robot)
     if refused and not _is_outvoted(ledger, meta, group, refused):
         return f"with cells of {', '.join(sorted(refused))} that are held back here"
     return ""
-
-
-def _has_compared(ledger: Ledger, robot: str) -> bool:
-    """Whether our own maps have told about it: by an edge that lives, or by one that we took back."""
-    said = ledger.mine.get(robot)
-    return pair_key(ledger.robot, robot) in ledger.live or (said is not None and said.stance is Stance.WITHDRAW)
 
 
 def _is_outvoted(ledger: Ledger, meta: GlobalMeta, group: Group, refused: set[str]) -> bool:

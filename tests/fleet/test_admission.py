@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from agent.fleet.admission import Admission
-from agent.fleet.ledger import Ledger
+from agent.fleet.ledger import Ledger, pair_key
 from agent.fleet.members import Peer
 from protocol.features import FeatureMap
 from protocol.geometry import SE2
@@ -141,6 +141,23 @@ def test_cells_held_back_from_a_neighbour_are_judged_anew_when_it_is_one_no_long
     admission._is_neighbour = lambda peer: False  # type: ignore[method-assign]
     admission.admit(peer, fleet.now_s)
     assert peer.held_back_s is None
+
+
+@pytest.mark.parametrize("witnesses", [0, 1, 2])
+@pytest.mark.parametrize("edge", ["lives", "taken back", "none"])
+def test_doubts_about_a_recipe_count_at_first_hand_or_with_two_witnesses(edge: str, witnesses: int) -> None:
+    fleet = merged_fleet(4)
+    admission, peer = admission_of(fleet)
+    ledger = admission._ledger
+    assert peer.held is not None
+    if edge == "taken back":
+        admission._pairs.words.withdraw("r1", "map turned false", fleet.now_s)
+    elif edge == "none":
+        ledger.mine.pop("r1")
+    if edge != "lives":
+        ledger.live.pop(pair_key("r0", "r1"))
+    admission._hold_back(peer, SE2.identity(), witnesses, fleet.now_s)
+    assert (peer.held.digest in peer.refused) == (edge != "none" or witnesses == 2)
 
 
 def test_the_same_cells_are_judged_anew_after_a_twin_s_came_between(monkeypatch: pytest.MonkeyPatch) -> None:
