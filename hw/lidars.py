@@ -9,7 +9,8 @@ from hw.driver import Driver
 from hw.hokuyo import Hokuyo
 from hw.ld06 import MODELS as LDROBOT_MODELS
 from hw.ld06 import Ld06
-from hw.rplidar import DEFAULT_PWM, DEFAULT_RPM, MODES, Rplidar
+from hw.rplidar import Rplidar
+from hw.rplidar_start import DEFAULT_PWM, DEFAULT_RPM, MODES
 from hw.sick_lms import RATE_CODES, SickLms
 from hw.spinning import SpinningLidar
 from hw.urls import DeviceUrl
