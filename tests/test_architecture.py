@@ -171,3 +171,11 @@ def test_every_room_is_known_and_every_module_says_what_it_is() -> None:
     violations("a file opens by saying what the thing is", found)
     rooms = {".".join(path.relative_to(ROOT).parts) for path in (ROOT / "agent").iterdir() if (path / "__init__.py").exists()}
     assert rooms - {"agent.commands"} <= set(MAY_IMPORT)
+
+
+def test_every_file_that_the_plan_of_the_house_names_is_there() -> None:
+    named = re.findall(
+        r"`((?:agent|hw|protocol|tests)/[\w/]+\.(?:py|md))`", (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    )
+    assert len(named) > 15
+    violations("ARCHITECTURE.md names it", [name for name in named if not (ROOT / name).is_file()])
