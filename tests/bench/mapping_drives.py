@@ -52,7 +52,7 @@ VARIATIONS: dict[str, Conditions] = {
     "black and glass walls": Conditions(black=0.1, glass=0.1, lost=0.05),
     "wheels 8 % long": Conditions(wheel_scale=1.08),
     "track 8 % wide": Conditions(track_scale=1.08),
-    "slip 20 %": Conditions(drive=DriveOptions(slip=0.2, scale_error=0.05)),
+    "slip 6 %": Conditions(drive=DriveOptions(slip=0.06, scale_error=0.03)),
     "slip bursts": Conditions(bursts=True),
     "fast": Conditions(drive=DriveOptions(speed_mps=1.0, turn_rad_s=2.0)),
     "fast, 5 Hz": Conditions(beams=180, scan_hz=5.0, drive=DriveOptions(speed_mps=1.0, turn_rad_s=2.0)),
