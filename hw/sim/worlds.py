@@ -8,19 +8,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hw.sim.places import Clearance
-from hw.sim.world import ROBOT_RADIUS_M, World, circle_points, polygon, sample_walls
-
-WALL_M = 0.12  # thickness of an inner wall
-DOOR_M = (0.95, 1.2)  # a robot of 0.4 m passes with room to spare
-PASSAGE_M = ROBOT_RADIUS_M + 0.12  # half the width that furniture leaves free
-Shape = NDArray[np.float64]  # (N, 4) segments
-Rect = tuple[float, float, float, float]  # x0, y0, x1, y1
+from hw.sim.building import (
+    Rect,
+    Shape,
+    chipped_outline,
+    furnished,
+    random_cuts,
+    random_doors,
+    turned_box,
+    wall_along_x,
+    wall_along_y,
+)
+from hw.sim.world import World, circle_points, polygon
 
 
 def office(seed: int = 0) -> World:
@@ -45,8 +48,8 @@ def _first_connected(make: Callable[[np.random.Generator, str], World | None], n
 def _office(rng: np.random.Generator, name: str) -> World | None:
     width, height = rng.uniform(22, 26), rng.uniform(14, 16)
     south, north = height * rng.uniform(0.38, 0.44), height * rng.uniform(0.53, 0.58)
-    shapes: list[Shape] = [polygon(_chipped_outline(rng, width, height))]
-    north_cuts, south_cuts = _cuts(rng, width, 3.2, 5.6), _cuts(rng, width, 2.8, 5.2)
+    shapes: list[Shape] = [polygon(chipped_outline(rng, width, height))]
+    north_cuts, south_cuts = random_cuts(rng, width, 3.2, 5.6), random_cuts(rng, width, 2.8, 5.2)
     lobby = int(rng.integers(1, len(north_cuts) - 2))
     rooms: list[Rect] = []
     for cuts, y_corridor, y_outer in ((north_cuts, north, height), (south_cuts, south, 0.0)):
@@ -56,23 +59,23 @@ def _office(rng: np.random.Generator, name: str) -> World | None:
             is_lobby = is_north and i == lobby
             if not is_lobby:
                 shapes.append(
-                    _wall_along_x(x0, x1, y_corridor, _doors(rng, x0, x1, 1 if x1 - x0 < 4.6 else int(rng.integers(1, 3))))
+                    wall_along_x(x0, x1, y_corridor, random_doors(rng, x0, x1, 1 if x1 - x0 < 4.6 else int(rng.integers(1, 3))))
                 )
                 rooms.append((x0, min(y_corridor, y_outer), x1, max(y_corridor, y_outer)))
             if i > 0:
                 low, high = sorted((y_corridor, y_outer))
                 linked = not is_lobby and rng.random() < 0.3
-                shapes.append(_wall_along_y(x0, low, high, _doors(rng, low, high, 1) if linked else []))
+                shapes.append(wall_along_y(x0, low, high, random_doors(rng, low, high, 1) if linked else []))
     shapes += _lobby_shapes(rng, north_cuts[lobby], north_cuts[lobby + 1], north, height)
-    return _furnished(rng, World.of(name, shapes), rooms, 0.16, _corridor_shapes(rng, width, south, north))
+    return furnished(rng, World.of(name, shapes), rooms, 0.16, _corridor_shapes(rng, width, south, north))
 
 
 def _random_rooms(rng: np.random.Generator, name: str) -> World | None:
     width, height = rng.uniform(14, 24), rng.uniform(10, 18)
-    shapes: list[Shape] = [polygon(_chipped_outline(rng, width, height))]
+    shapes: list[Shape] = [polygon(chipped_outline(rng, width, height))]
     rooms: list[Rect] = []
     _split(rng, (0.0, 0.0, width, height), shapes, rooms)
-    return _furnished(rng, World.of(name, shapes), rooms, 0.2)
+    return furnished(rng, World.of(name, shapes), rooms, 0.2)
 
 
 def outdoor(seed: int = 0) -> World:
@@ -82,8 +85,8 @@ def outdoor(seed: int = 0) -> World:
     shapes: list[Shape] = [polygon(_hedge(rng, width, height))]
     taken: list[tuple[float, float, float]] = []
     makers: list[tuple[int, float, Callable[[float, float], Shape]]] = [
-        (4, 3.6, lambda x, y: _turned_box(rng, x, y, rng.uniform(3, 5.5), rng.uniform(2, 3.5))),
-        (6, 2.6, lambda x, y: _turned_box(rng, x, y, 4.2, 1.8)),
+        (4, 3.6, lambda x, y: turned_box(rng, x, y, rng.uniform(3, 5.5), rng.uniform(2, 3.5))),
+        (6, 2.6, lambda x, y: turned_box(rng, x, y, 4.2, 1.8)),
         (9, 1.6, lambda x, y: _bush(rng, x, y)),
         (22, 1.0, lambda x, y: polygon(circle_points(x, y, float(rng.uniform(0.12, 0.4))))),
     ]
@@ -99,47 +102,6 @@ def outdoor(seed: int = 0) -> World:
 
 
 BUILT_IN: dict[str, Callable[[int], World]] = {"office": office, "outdoor": outdoor, "random": random_rooms}
-
-
-def _cuts(rng: np.random.Generator, length: float, low: float, high: float) -> list[float]:
-    """0 = c0 < c1 < ... = length with every gap between low and about high."""
-    cuts = [0.0]
-    while length - cuts[-1] > max(high, 2 * low):
-        cuts.append(cuts[-1] + rng.uniform(low, min(high, length - cuts[-1] - low)))
-    return [*cuts, length]
-
-
-def _doors(rng: np.random.Generator, low: float, high: float, count: int) -> list[tuple[float, float]]:
-    """(from, to) of `count` openings along a wall, clear of its ends and of one another."""
-    doors = []
-    part = (high - low) / count
-    for i in range(count):
-        door = float(rng.uniform(*DOOR_M))
-        a = low + i * part
-        start = rng.uniform(a + 0.35, max(a + 0.36, a + part - door - 0.35))
-        doors.append((start, start + door))
-    return doors
-
-
-def _wall_along_x(x0: float, x1: float, y: float, doors: list[tuple[float, float]]) -> Shape:
-    edges = [x0 - WALL_M / 2, *(edge for door in doors for edge in door), x1 + WALL_M / 2]
-    half = WALL_M / 2
-    return np.concatenate([polygon([(a, y - half), (b, y - half), (b, y + half), (a, y + half)]) for a, b in _pairs(edges)])
-
-
-def _wall_along_y(x: float, y0: float, y1: float, doors: list[tuple[float, float]]) -> Shape:
-    return _wall_along_x(y0, y1, x, doors)[:, [1, 0, 3, 2]]
-
-
-def _pairs(edges: list[float]) -> list[tuple[float, float]]:
-    return list(zip(edges[::2], edges[1::2], strict=True))
-
-
-def _chipped_outline(rng: np.random.Generator, width: float, height: float) -> list[tuple[float, float]]:
-    """A rectangle with its corners cut at different slants."""
-    a, b, c, d = rng.uniform(0.5, 1.6, 4)
-    e, f, g, h = rng.uniform(0.5, 1.6, 4)
-    return [(a, 0), (width - b, 0), (width, e), (width, height - f), (width - c, height), (d, height), (0, height - g), (0, h)]
 
 
 def _lobby_shapes(rng: np.random.Generator, x0: float, x1: float, y0: float, y1: float) -> list[Shape]:
@@ -173,60 +135,14 @@ def _split(rng: np.random.Generator, room: Rect, shapes: list[Shape], rooms: lis
     k = rng.uniform(0.36, 0.64)
     if w > h:
         x = x0 + k * w
-        shapes.append(_wall_along_y(x, y0, y1, _doors(rng, y0, y1, 2 if h > 7 else 1)))
+        shapes.append(wall_along_y(x, y0, y1, random_doors(rng, y0, y1, 2 if h > 7 else 1)))
         halves = [(x0, y0, x, y1), (x, y0, x1, y1)]
     else:
         y = y0 + k * h
-        shapes.append(_wall_along_x(x0, x1, y, _doors(rng, x0, x1, 2 if w > 7 else 1)))
+        shapes.append(wall_along_x(x0, x1, y, random_doors(rng, x0, x1, 2 if w > 7 else 1)))
         halves = [(x0, y0, x1, y), (x0, y, x1, y1)]
     for half in halves:
         _split(rng, half, shapes, rooms)
-
-
-def _furnished(
-    rng: np.random.Generator, bare: World, rooms: list[Rect], pieces_per_m2: float, wanted: Sequence[Shape] = ()
-) -> World | None:
-    """Add furniture, keeping only what leaves every place reachable; None when the bare rooms are not connected."""
-    shapes, clearance = [bare.segments], Clearance.of(bare)
-    if not clearance.is_one_place(PASSAGE_M):
-        return None
-    pieces = list(wanted)
-    for room in rooms:
-        area_m2 = (room[2] - room[0]) * (room[3] - room[1])
-        pieces += [_piece(rng, room) for _ in range(max(1, round(area_m2 * pieces_per_m2)))]
-    for piece in pieces:
-        with_piece = clearance.with_walls(sample_walls(piece, clearance.resolution_m / 2))
-        if with_piece.is_one_place(PASSAGE_M):
-            shapes.append(piece)
-            clearance = with_piece
-    return World.of(bare.name, shapes)
-
-
-def _piece(rng: np.random.Generator, room: Rect) -> Shape:
-    """A cupboard or desk against a wall, a table at an angle, or something round."""
-    x0, y0, x1, y1 = room
-    kind = rng.random()
-    x, y = rng.uniform(x0 + 0.9, x1 - 0.9), rng.uniform(y0 + 0.9, y1 - 0.9)
-    if kind < 0.22:
-        return polygon(circle_points(x, y, float(rng.uniform(0.15, 0.55))))
-    if kind < 0.42:
-        return _turned_box(rng, x, y, rng.uniform(0.6, 1.6), rng.uniform(0.4, 0.8))
-    length, depth = rng.uniform(0.6, 2.0), rng.uniform(0.3, 0.8)
-    side = int(rng.integers(4))
-    if side == 0:
-        return polygon([(x, y0), (x + length, y0), (x + length, y0 + depth), (x, y0 + depth)])
-    if side == 1:
-        return polygon([(x, y1 - depth), (x + length, y1 - depth), (x + length, y1), (x, y1)])
-    if side == 2:
-        return polygon([(x0, y), (x0 + depth, y), (x0 + depth, y + length), (x0, y + length)])
-    return polygon([(x1 - depth, y), (x1, y), (x1, y + length), (x1 - depth, y + length)])
-
-
-def _turned_box(rng: np.random.Generator, x: float, y: float, length: float, depth: float) -> Shape:
-    turn = rng.uniform(0, math.pi)
-    c, s = math.cos(turn), math.sin(turn)
-    corners = np.array([(-length, -depth), (length, -depth), (length, depth), (-length, depth)]) / 2
-    return polygon(corners @ np.array([[c, s], [-s, c]]) + (x, y))
 
 
 def _bush(rng: np.random.Generator, x: float, y: float) -> Shape:
