@@ -139,6 +139,7 @@ class Xv11(FixedFrameLidar):
         self.identity.model = kind.name
         self.bauds = (kind.baud,)
         self.baud = kind.baud
+        self._assembler.witnesses = tuple(range(1, kind.beams // 2 + 1))  # of any beam some lie in another packet
         self._last_index = 0
 
     def start(self) -> Script:

@@ -6,6 +6,7 @@ import numpy as np
 
 from hw.clock import DeviceClock
 from hw.scan_assembler import Beams, ScanAssembler, coverage_of, is_evenly_spaced, supported_only
+from hw.xv11 import LDS01, Xv11
 
 
 def _beams(turns: np.ndarray, begin_s: float = 0.0, dirty: bool = False) -> Beams:
@@ -109,3 +110,11 @@ def test_a_clock_that_begins_anew_is_followed() -> None:
         clock.to_host(10.0 + 0.1 * k, 500.0 + 0.1 * k)
     assert clock.to_host(0.0, 510.0) == 510.0
     assert abs(clock.to_host(0.1, 510.11) - 510.1) < 0.02
+
+
+def test_a_packet_of_another_place_does_not_bear_itself_out() -> None:
+    """Six beams of an LDS-01 whose index was damaged, at the edge of a hole: only what lies outside of the packet tells."""
+    packet = np.array([2.31, 2.39, 2.475, 2.556, 2.643, 2.735])
+    seen = np.concatenate([[2.519, 2.524, 2.531, 2.538, 2.546, 2.555], packet, [np.nan] * 6])
+    assert np.isfinite(supported_only(seen)[6:12]).any()
+    assert np.isnan(supported_only(seen, Xv11(LDS01)._assembler.witnesses)[6:12]).all()
