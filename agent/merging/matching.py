@@ -13,6 +13,7 @@ from agent.merging.grounds import weighed
 from agent.merging.mirror import is_mirror_image
 from agent.merging.paper import match_maps_like_the_paper
 from agent.merging.refinement import FINE_GATES_M, normal_equations, refined
+from agent.merging.refutation import unrefuted
 from agent.merging.result import Alternative, MatchOptions, MatchStatus, MergeResult, Reason
 from agent.merging.search import FIRST_PASS, SECOND_PASS, search
 from agent.merging.transforms import Poses, to_se2
@@ -34,10 +35,12 @@ def match_maps(ours: MapSnapshot, theirs: MapSnapshot, options: MatchOptions | N
         return MergeResult.none(Reason.EMPTY)
     poses, tried = search(ours, theirs, FIRST_PASS)
     result = judged(ours, theirs, poses, tried, options)
-    if options.thorough and not result.accepted:
-        more, also_tried = search(ours, theirs, SECOND_PASS)
-        result = judged(ours, theirs, np.concatenate([poses, more]), tried + also_tried, options)
-    return result
+    if result.accepted or not options.thorough:
+        return result
+    more, also_tried = search(ours, theirs, SECOND_PASS)
+    poses, tried = np.concatenate([poses, more]), tried + also_tried
+    result = judged(ours, theirs, poses, tried, options)
+    return result if result.accepted else _without_refuted(ours, theirs, poses, result, options)
 
 
 def verify_match(ours: MapSnapshot, theirs: MapSnapshot, T_ours_theirs: SE2, options: MatchOptions | None = None) -> MergeResult:
@@ -80,6 +83,17 @@ def judged(ours: MapSnapshot, theirs: MapSnapshot, poses: Poses, tried: int, opt
         tuple(Alternative(_map_frame(ours, theirs, poses[i]), float(scores[i])) for i in order[1 : 1 + _ALTERNATIVES]),
         grounds.numbers(),
     )
+
+
+def _without_refuted(
+    ours: MapSnapshot, theirs: MapSnapshot, poses: Poses, result: MergeResult, options: MatchOptions
+) -> MergeResult:
+    """This undecided result, or the merge that it becomes when hypotheses that refute themselves are left out."""
+    left = unrefuted(ours, theirs, poses, options) if len(poses) and result.score > options.min_margin_m else poses
+    if len(left) == len(poses):
+        return result
+    again = judged(ours, theirs, left, result.candidates_tried, options)
+    return again if again.accepted else result
 
 
 def _covariance(ours: MapSnapshot, theirs: MapSnapshot, pose: NDArray[np.float64]) -> NDArray[np.float64]:

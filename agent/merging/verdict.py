@@ -57,6 +57,15 @@ class Grounds:
         factor = self.factor + FACTOR_SLOPE * max(0.0, self.cell_m - 0.1)
         return 13.0 * (USUAL_FACTOR - factor) + math.sqrt(min(self.attached_doubt, 0.5)) + 1.6 * math.sqrt(self.deep_doubt)
 
+    @property
+    def is_refuted(self) -> bool:
+        """Whether no margin could get this merged."""
+        return self.suspicion > MAX_SUSPICION
+
+    def is_clear(self, options: MatchOptions) -> bool:
+        """Whether nothing is doubtful here, and more than long walls agrees."""
+        return self.suspicion < options.unsuspicious and self.distinct_m >= MIN_DISTINCT_M
+
     def numbers(self) -> dict[str, float]:
         return {name: float(getattr(self, name)) for name in (*self.__slots__, "suspicion")}
 
@@ -76,7 +85,7 @@ def verdict(grounds: Grounds, options: MatchOptions) -> tuple[MatchStatus, str]:
         return MatchStatus.AMBIGUOUS, Reason.RIVAL
     is_bare = g.distinct_m < MIN_DISTINCT_M and g.score - g.rival < CLEAR_MARGIN_M
     grave_m = options.min_margin_m + MARGIN_PER_GRAVE_SUSPICION_M * (g.suspicion - GRAVE_SUSPICION)
-    if g.suspicion > MAX_SUSPICION or is_bare or g.score - g.rival <= grave_m:
+    if g.is_refuted or is_bare or g.score - g.rival <= grave_m:
         return MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE
     return MatchStatus.MERGED, Reason.MATCHED
 
@@ -94,7 +103,13 @@ def _needed_margin_m(g: Grounds, options: MatchOptions) -> float:
 
 def rival_score(poses: Poses, scores: NDArray[np.float64], best: int, around_m: NDArray[np.float64]) -> float:
     """Score of the best transform that means something else; zero when there is none."""
+    apart = elsewhere(poses, best, around_m)
+    return max(0.0, float(scores[apart].max())) if apart.any() else 0.0
+
+
+def elsewhere(poses: Poses, best: int, around_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(C,) which transforms mean something else than this one."""
     place = applied(poses, around_m)
     apart = np.hypot(*(place - place[best]).T) > SAME_PLACE_M
     apart |= angle_between(poses[:, 2], float(poses[best, 2])) > SAME_TURN_RAD
-    return max(0.0, float(scores[apart].max())) if apart.any() else 0.0
+    return np.asarray(apart)
