@@ -25,6 +25,18 @@ GOOD = Grounds(
 # what two parts of a building had to say for each other, one of them turned over
 MIRRORED_PARTS = {"score": 22.6, "rival": 2.6, "factor": 0.94, "attached_doubt": 0.29, "deep_doubt": 0.08}
 
+# two ends of a hotel whose rooms are all alike, and a corridor where the second best comes as near to a true overlap
+HOTEL = {
+    "score": 53.7,
+    "rival": 36.2,
+    "agreeing_m": 65.7,
+    "against_m": 1.7,
+    "potential_m": 58.7,
+    "factor": 0.945,
+    "deep_doubt": 0.005,
+}
+CORRIDOR = {"score": 21.5, "rival": 14.9, "agreeing_m": 25.9, "against_m": 0.2, "potential_m": 22.7, "deep_doubt": 0.0}
+
 
 def test_good_grounds_merge() -> None:
     assert verdict(GOOD, MatchOptions()) == (MatchStatus.MERGED, Reason.MATCHED)
@@ -32,6 +44,11 @@ def test_good_grounds_merge() -> None:
 
 def test_long_walls_alone_merge_when_no_rival_comes_near() -> None:
     assert verdict(replace(GOOD, distinct_m=3.5), MatchOptions()) == (MatchStatus.MERGED, Reason.MATCHED)
+
+
+def test_a_near_rival_does_not_hurt_what_is_flawless() -> None:
+    assert verdict(replace(GOOD, rival=20.0, deep_doubt=0.0), MatchOptions()) == (MatchStatus.MERGED, Reason.MATCHED)
+    assert verdict(replace(GOOD, **CORRIDOR), MatchOptions()) == (MatchStatus.MERGED, Reason.MATCHED)
 
 
 def test_little_but_long_walls_must_be_less_suspicious() -> None:
@@ -53,6 +70,9 @@ def test_little_but_long_walls_must_be_less_suspicious() -> None:
         ({"rival": 30.0}, MatchStatus.AMBIGUOUS, Reason.RIVAL),
         ({"distinct_m": 3.5, "score": 24.0}, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
         ({"factor": 0.88, "attached_doubt": 0.6, "deep_doubt": 0.05}, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
+        ({"rival": 20.0}, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
+        ({"rival": 26.0, "deep_doubt": 0.0}, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
+        (HOTEL, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
         (MIRRORED_PARTS, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
     ],
 )
