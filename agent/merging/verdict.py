@@ -28,8 +28,8 @@ GRAVE_SUSPICION = 0.8  # few true pairs look worse, and those that do are far ah
 MARGIN_PER_GRAVE_SUSPICION_M = 45.0  # mirrored parts of a building at 1.2 were ahead by 20 m
 MIN_DISTINCT_M = 4.0  # two ends of a building share long walls; what tells them apart is short,
 CLEAR_MARGIN_M = 25.0  # unless nothing else comes near: ends that were merged wrongly were ahead by 7 to 13 m
-NEAR_RIVAL, FLAW = 0.45, 0.002  # share of the score, and `deep_doubt` that is more than none
-REPEATED, REPEATED_M = 0.6, 24.0  # a rival of this share and so much wall is no accident
+FLAW = 0.002  # of `deep_doubt`: more than none
+REPEATED_SHARE, REPEATED_M = 0.6, 24.0  # a rival of this share of the score and so much wall is no accident
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,19 +87,21 @@ def verdict(grounds: Grounds, options: MatchOptions) -> tuple[MatchStatus, str]:
         return MatchStatus.AMBIGUOUS, Reason.RIVAL
     is_bare = g.distinct_m < MIN_DISTINCT_M and g.score - g.rival < CLEAR_MARGIN_M
     grave_m = options.min_margin_m + MARGIN_PER_GRAVE_SUSPICION_M * (g.suspicion - GRAVE_SUSPICION)
-    if g.is_refuted or is_bare or g.score - g.rival <= grave_m or _is_one_of_many(g):
+    if g.is_refuted or is_bare or g.score - g.rival <= grave_m or _is_one_of_many(g, options):
         return MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE
     return MatchStatus.MERGED, Reason.MATCHED
 
 
-def _is_one_of_many(g: Grounds) -> bool:
+def _is_one_of_many(g: Grounds, options: MatchOptions) -> bool:
     """Whether the building repeats what agrees here, so that the best place may be as wrong as the second best.
 
     Two ends of a hotel with one kind of room fit over fifty metres of wall, shifted by a room nearly as well.  A true overlap
     with a rival so near is flawless, as a rule; a wrong one has some furniture in the middle of the other map's free space.
     """
     share = g.rival / g.score
-    return (share > NEAR_RIVAL and g.deep_doubt > FLAW) or (share > REPEATED and g.rival > REPEATED_M)
+    if share <= options.near_rival_share:
+        return False
+    return g.deep_doubt > FLAW or (share > REPEATED_SHARE and g.rival > REPEATED_M)
 
 
 def _needed_margin_m(g: Grounds, options: MatchOptions) -> float:
