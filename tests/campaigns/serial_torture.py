@@ -49,12 +49,11 @@ class Tally:
 
 
 def main() -> int:
-    args = options(__doc__, "protocols").parse_args()
-    names = args.only.split(",") if args.only else list(STREAMS)
+    args = options(__doc__, "protocols", STREAMS).parse_args()
     if not args.json:
         print(f"{how(args.share, args.kind)}\n")
     tallies: list[Tally] = []
-    for name in names:
+    for name in args.only:
         tallies.append(torture(name, args.hours, args.share, args.seed, args.kind))
         row = figures(tallies[-1])
         if not args.json:

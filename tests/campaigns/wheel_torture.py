@@ -86,9 +86,8 @@ class Tally:
 
 
 def main() -> int:
-    args = options(__doc__, "bases").parse_args()
-    names = args.only.split(",") if args.only else BASES
-    tallies = [torture(name, args.hours, args.share, args.seed, args.kind) for name in names]
+    args = options(__doc__, "bases", BASES).parse_args()
+    tallies = [torture(name, args.hours, args.share, args.seed, args.kind) for name in args.only]
     print(json.dumps([asdict(tally) for tally in tallies], indent=2) if args.json else table(tallies, args.share, args.kind))
     return int(any(tally.teleports for tally in tallies))
 

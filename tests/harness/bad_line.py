@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,14 +12,14 @@ BURST_BYTES = 20.0  # the usual length of a burst, geometrically distributed: a 
 KINDS = ("bytes", "bursts")
 
 
-def options(doc: str, victims: str) -> argparse.ArgumentParser:
-    """What a campaign on bad lines is told; `victims` are what stands at their ends."""
+def options(doc: str, victims: str, names: Iterable[str]) -> argparse.ArgumentParser:
+    """What a campaign on bad lines is told; `victims` are what stands at their ends, each of the `names` unless `only` some."""
     parser = argparse.ArgumentParser(description=doc.split("\n", maxsplit=1)[0])
     parser.add_argument("--hours", type=float, default=1.0, help=f"of robot time for each of the {victims}")
     parser.add_argument("--share", type=float, default=0.01, help="of bytes damaged: half lost, half altered")
     parser.add_argument("--kind", choices=KINDS, default="bytes", help="one by one, or in bursts")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", help=f"{victims}, separated by commas")
+    parser.add_argument("--only", nargs="+", choices=list(names), default=list(names), help=victims)
     parser.add_argument("--json", action="store_true")
     return parser
 
