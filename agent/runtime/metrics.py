@@ -60,6 +60,7 @@ def families(status: Mapping[str, Any]) -> Iterator[tuple[str, str, str, list[Sa
     ages: list[Sample] = [({"a": e["a"], "b": e["b"]}, e["age_s"]) for e in status.get("edges", []) if e["age_s"] is not None]
     yield "edge_age_seconds", "gauge", "Since an edge last began.", ages
     yield "worker_idle_seconds", "gauge", "Since a worker's last step.", [({"worker": w["name"]}, w["idle_s"]) for w in workers]
+    yield "worker_cpu_seconds_total", "counter", "Of its thread.", [({"worker": w["name"]}, w["cpu_s"]) for w in workers]
     yield "worker_errors_total", "counter", "Steps that failed.", [({"worker": w["name"]}, w["errors"]) for w in workers]
 
 

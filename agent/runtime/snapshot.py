@@ -216,6 +216,7 @@ def workers(node: Node) -> list[dict[str, Any]]:
             "name": r.name,
             "idle_s": round(r.idle_s, 1),
             "steps": r.steps,
+            "cpu_s": round(r.cpu_s, 2),
             "errors": r.errors,
             "error": r.last_error,
             "stuck": r.is_stuck,

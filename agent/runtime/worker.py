@@ -27,6 +27,7 @@ class WorkerReport:
     steps: int
     errors: int
     last_error: str
+    cpu_s: float = 0.0  # of its thread, so far
     is_failing: bool = False  # the newest step ended with an exception
 
     @property
@@ -46,6 +47,7 @@ class Worker:
         self.steps = 0
         self.errors = 0
         self.last_error = ""
+        self._cpu_s = 0.0
         self._is_failing = False
 
     def start(self) -> None:
@@ -63,7 +65,9 @@ class Worker:
 
     def report(self) -> WorkerReport:
         idle_s = time.monotonic() - self._progress_s
-        return WorkerReport(self.name, idle_s, self.deadline_s, self.steps, self.errors, self.last_error, self._is_failing)
+        return WorkerReport(
+            self.name, idle_s, self.deadline_s, self.steps, self.errors, self.last_error, self._cpu_s, self._is_failing
+        )
 
     def _run(self) -> None:
         while not self._stop.is_set():
@@ -73,6 +77,7 @@ class Worker:
             except Exception as error:
                 self._note(error)
             self.steps += 1
+            self._cpu_s = time.thread_time()
             self._progress_s = time.monotonic()
 
     def _note(self, error: Exception) -> None:

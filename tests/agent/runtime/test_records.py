@@ -24,7 +24,7 @@ STATUS: dict[str, Any] = {
     "peers": [{"robot": 'r"2\n', "age_s": 0.5, "match_factor": 0.97, "attempts": 3}],
     "edges": [{"a": "r1", "b": 'r"2\n', "age_s": 3.5}],
     "merge_times": {"peers": 1, "p50_s": 4.2, "p90_s": 4.2, "max_s": 4.2},
-    "workers": [{"name": "map", "idle_s": 0.1, "errors": 0}],
+    "workers": [{"name": "map", "idle_s": 0.1, "cpu_s": 1.5, "errors": 0}],
 }
 
 

@@ -37,6 +37,14 @@ def test_an_exception_is_counted_and_the_worker_goes_on(caplog: pytest.LogCaptur
     assert len([r for r in caplog.records if "worker=w" in r.message]) == 1  # the first time only
 
 
+def test_a_worker_says_what_it_costs() -> None:
+    worker = Worker("w", lambda: sum(range(100_000)) and None, 5.0, "in", "out")
+    worker.start()
+    until(lambda: worker.report().cpu_s > 0.02)
+    worker.ask_to_stop()
+    assert worker.join(2.0)
+
+
 def test_a_worker_that_does_not_come_back_is_stuck_and_the_watchdog_hungry(tmp_path: Path) -> None:
     release = threading.Event()
     worker = Worker("w", lambda: release.wait(5.0) and None, 0.05, "in", "out")
