@@ -29,6 +29,7 @@ MOST_PAYLOAD = 812
 STATUS, TYPE, RESET, MODE, VARIANT = b"\x31", b"\x3a", b"\x10", 0x20, 0x3B
 CONTINUOUS, POLLED, PARTIAL = bytes((MODE, 0x24)), bytes((MODE, 0x25)), bytes((MODE, 0x2A))
 ONE_SCAN, GET_CONFIG, SET_CONFIG = b"\x30\x01", 0x74, 0x77
+MEASURING_MODE_AT, UNIT_AT = 5, 6  # in the configuration
 RATE_CODES = {9600: 0x42, 19200: 0x41, 38400: 0x40, 500000: 0x48}
 INSTALL = bytes((MODE, 0x00)) + b"SICK_LMS"
 FIELDS = {
@@ -40,7 +41,8 @@ FIELDS = {
 }  # values: (degrees, step)
 MIRROR_S = 1 / 75  # a turn of the mirror; half- and quarter-degree scans take two and four
 RANGE_MIN_M, RANGE_MAX_M = 0.05, 80.0
-CM_CODES, MM_CODES = 0x1FF7, 0x7FF7  # from here on a value is no distance: dazzled, out of range, ...
+VALUE_MASKS = dict.fromkeys((0, 1, 2), 0x1FFF) | dict.fromkeys((3, 4), 0x3FFF) | dict.fromkeys((5, 6, 15), 0x7FFF)
+CODES = 9  # the highest so many values are no distances: dazzled, out of range, ...
 HEAD_BYTES = 4
 
 
@@ -99,12 +101,18 @@ class ScanPayload:
         return ScanPayload(struct.unpack_from(f"<{n}H", payload, 3), info >> 14 == 1, payload[-1])
 
 
-def ranges_m(scan: ScanPayload) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """Metres; nan where the scanner saw nothing or says why not.  In cm the upper three bits are field flags."""
-    raw = np.array(scan.values, np.int64)
-    value = raw & (0x7FFF if scan.is_mm else 0x1FFF)
-    is_invalid = (value == 0) | (value >= (MM_CODES if scan.is_mm else CM_CODES))
-    return np.where(is_invalid, np.nan, value / (1000.0 if scan.is_mm else 100.0))
+def ranges_m(scan: ScanPayload, measuring_mode: int | None = None) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    """Metres; nan where the scanner saw nothing or says why not.
+
+    The measuring mode says how many of the upper bits are field flags (`VALUE_MASKS`), and so where the codes begin: in
+    millimetres "nothing" is 8191, 16383 or 32767.  While it is not known, all three are taken for codes.  Centimetres reach
+    82 metres in 13 bits, whatever the mode.
+    """
+    mask = VALUE_MASKS.get(-1 if measuring_mode is None else measuring_mode) if scan.is_mm else 0x1FFF
+    value = np.array(scan.values, np.int64) & (mask or 0x7FFF)
+    tops = (mask,) if mask else (0x1FFF, 0x3FFF, 0x7FFF)
+    is_code = np.any([(value > top - CODES) & (value <= top) for top in tops], axis=0)
+    return np.where((value == 0) | is_code, np.nan, value / (1000.0 if scan.is_mm else 100.0))
 
 
 def _size(data: bytearray) -> int:
@@ -129,6 +137,7 @@ class SickLms(DriverBase):
             bytes((STX, SCANNER_ADDRESS)), HEAD_BYTES, 6 + MOST_PAYLOAD, _size, lambda f: crc16(f[:-2]) == (f[-2] | f[-1] << 8)
         )
         self._answers: dict[int, bytes] = {}
+        self._measuring_mode: int | None = None  # not known
         self._last_scan_s: float | None = None
         self._suspicion = Suspicion()
         self._held: LaserScan | None = None  # on a line that is not clean, until the next telegram begins
@@ -156,6 +165,8 @@ class SickLms(DriverBase):
             yield self._ask(bytes((MODE, RATE_CODES[self._rate])), 0xA0, 0.5)  # answered at the old rate
             yield SetBaud(self._rate)
             yield Pause(0.05)
+        config = yield self._ask(bytes((GET_CONFIG,)), 0xF4, 0.5)
+        self._measuring_mode = config[1 + MEASURING_MODE_AT] if config and len(config) > 1 + MEASURING_MODE_AT else None
         if self._step_deg is not None:
             yield self._ask(variant_request(100 if self._step_deg < 0.5 else 180, self._step_deg), 0xBB, 1.0)
         if (yield self._ask(CONTINUOUS, 0xA0, 1.0)) is None:
@@ -204,7 +215,7 @@ class SickLms(DriverBase):
         """The last beam was measured before the telegram began."""
         field_deg, step_deg = FIELDS[len(scan.values)]
         duration_s = MIRROR_S / step_deg * field_deg / 360.0
-        metres = ranges_m(scan)
+        metres = ranges_m(scan, self._measuring_mode)
         with np.errstate(invalid="ignore"):
             metres = np.where((metres < self.range_min_m) | (metres > self.range_max_m), np.nan, metres)
         if self._suspicion:

@@ -125,7 +125,21 @@ def test_sick_flags_and_codes_are_no_ranges() -> None:
     values = [0x2000 | 800, 0x1FF7, 0, 0x1FFF] + [800] * 177
     metres = sick_lms.ranges_m(sick_lms.ScanPayload(tuple(values)))
     assert np.array_equal(metres[:5], [8.0, np.nan, np.nan, np.nan, 8.0], equal_nan=True)
-    assert np.isnan(sick_lms.ranges_m(sick_lms.ScanPayload((0x7FF7,) + (8000,) * 180, is_mm=True))[0])
+
+
+@pytest.mark.parametrize(("mode", "seen"), [
+    (0, [8.0, 8.0, 7.807, np.nan, np.nan, np.nan]), (4, [8.0, 16.192, 15.999, 8.191, np.nan, np.nan]),
+    (6, [8.0, 16.192, 15.999, 8.191, 16.383, np.nan]), (None, [8.0, 16.192, 15.999, np.nan, np.nan, np.nan]),
+])  # fmt: skip
+def test_what_is_nothing_in_millimetres_depends_on_the_measuring_mode(mode: int | None, seen: list[float]) -> None:
+    values = [8000, 0x2000 | 8000, 15999, 0x1FFF, 0x3FFF, 0x7FF7] + [8000] * 175
+    metres = sick_lms.ranges_m(sick_lms.ScanPayload(tuple(values), is_mm=True), mode)
+    assert np.allclose(metres[:6], seen, equal_nan=True)
+
+
+def test_a_sick_in_a_hall_beyond_its_eight_metres_draws_no_wall_there() -> None:
+    driver = SickLms()
+    assert np.isnan(driver.feed(sick_lms.scan_telegram([0x1FFF] * 181, is_mm=True), 1.0)[0].ranges_m).all()
 
 
 @settings(max_examples=50, deadline=None)
