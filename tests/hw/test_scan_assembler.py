@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from hw.clock import DeviceClock
 from hw.scan_assembler import Beams, ScanAssembler, coverage_of, is_evenly_spaced, supported_only
@@ -110,6 +111,25 @@ def test_a_clock_that_begins_anew_is_followed() -> None:
         clock.to_host(10.0 + 0.1 * k, 500.0 + 0.1 * k)
     assert clock.to_host(0.0, 510.0) == 510.0
     assert abs(clock.to_host(0.1, 510.11) - 510.1) < 0.02
+
+
+@pytest.mark.parametrize("stall_s", [0.4, 0.9, 3.0])
+def test_what_waited_while_nobody_read_keeps_its_time(stall_s: float) -> None:
+    """A host that was busy finds a line full of old messages, the newest of which may have been lost."""
+    clock = DeviceClock(30.0)
+    for sent_s in np.arange(0.0, 20.0, 0.02):
+        is_waiting = 10.0 <= sent_s < 10.0 + stall_s
+        if 10.0 + 0.7 * stall_s < sent_s < 10.0 + stall_s:
+            continue
+        arrival_s = 500.0 + (10.0 + stall_s if is_waiting else sent_s)
+        assert abs(clock.to_host((sent_s + 20.0) % 30.0, arrival_s) - 500.0 - sent_s) < 1e-3
+
+
+def test_a_clock_that_stood_still_is_believed_again() -> None:
+    clock = DeviceClock(30.0)
+    sent_s = np.concatenate([np.arange(0.0, 10.0, 0.02), np.arange(10.8, 13.0, 0.02)])
+    host_s = [clock.to_host(0.02 * k, 500.0 + float(at_s)) for k, at_s in enumerate(sent_s)]
+    assert abs(host_s[-1] - 500.0 - sent_s[-1]) < 1e-3
 
 
 def test_a_packet_of_another_place_does_not_bear_itself_out() -> None:
