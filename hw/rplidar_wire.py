@@ -12,11 +12,13 @@ from dataclasses import dataclass
 SYNC = 0xA5
 DESCRIPTOR_BYTES = 7
 STOP_CMD, RESET_CMD, SCAN_CMD = 0x25, 0x40, 0x20
-EXPRESS_CMD, GET_CONF_CMD = 0x82, 0x84
+EXPRESS_CMD, HQ_CMD, GET_CONF_CMD, SET_CONF_CMD, NEW_BAUD_CMD = 0x82, 0x83, 0x84, 0x85, 0x90
 INFO_CMD, HEALTH_CMD, SAMPLERATE_CMD = 0x50, 0x52, 0x59
 PWM_CMD, RPM_CMD, BOARD_FLAG_CMD = 0xF0, 0xA8, 0xFF
+WITH_PAYLOAD = (EXPRESS_CMD, HQ_CMD, GET_CONF_CMD, SET_CONF_CMD, NEW_BAUD_CMD, PWM_CMD, RPM_CMD, BOARD_FLAG_CMD)
+MOST_PAYLOAD = 64  # some hosts fill their questions up to 36 bytes
 
-INFO_TYPE, HEALTH_TYPE, SAMPLERATE_TYPE, CONF_TYPE, BOARD_FLAG_TYPE = 0x04, 0x06, 0x15, 0x20, 0xFF
+INFO_TYPE, HEALTH_TYPE, SAMPLERATE_TYPE, CONF_TYPE, CONF_SET_TYPE, BOARD_FLAG_TYPE = 0x04, 0x06, 0x15, 0x20, 0x21, 0xFF
 NODE_TYPE, EXPRESS_TYPE, HQ_TYPE, ULTRA_TYPE, DENSE_TYPE, ULTRA_DENSE_TYPE = 0x81, 0x82, 0x83, 0x84, 0x85, 0x86
 SCAN_LENGTHS = {NODE_TYPE: 5, EXPRESS_TYPE: 84, HQ_TYPE: 781, ULTRA_TYPE: 132, DENSE_TYPE: 84, ULTRA_DENSE_TYPE: 170}
 
@@ -73,8 +75,10 @@ def parse_request(data: bytes | bytearray) -> tuple[Request | None, int]:
     if len(data) < at + 2:
         return None, at
     command = data[at + 1]
-    if not command & 0x80:
+    if command < 0x80:
         return Request(command), at + 2
+    if command not in WITH_PAYLOAD or (len(data) > at + 2 and data[at + 2] > MOST_PAYLOAD):
+        return None, at + 1  # the second byte may itself begin a request
     if len(data) < at + 3 or len(data) < at + 4 + data[at + 2]:
         return None, at
     end = at + 4 + data[at + 2]

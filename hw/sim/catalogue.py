@@ -17,7 +17,8 @@ from hw.sim.hokuyo_sim import HokuyoSim
 from hw.sim.kobuki_sim import KobukiSim
 from hw.sim.roboclaw_sim import RoboClawSim
 from hw.sim.robot import DriveOptions
-from hw.sim.rplidar_sim import UNITS, RplidarSim
+from hw.sim.rplidar_sim import RplidarSim
+from hw.sim.rplidar_units import UNITS
 from hw.sim.sick_sim import SickSim
 from hw.sim.sight import Sight
 from hw.sim.spinning_sim import LdrobotSim, NeatoSim

@@ -1,84 +1,21 @@
-"""A simulated RPLIDAR: answers GET_INFO, GET_HEALTH, the configuration protocol and the motor commands, scans in every mode.
-
-Three units stand for three generations: the A1 at 115200 baud with the express mode, the C1 at 460800 with the dense mode and
-the S2 at a million baud with 3200 beams a turn.
-"""
+"""A simulated RPLIDAR: answers GET_INFO, GET_HEALTH, the configuration protocol and the motor commands, scans in every mode."""
 
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 
 import numpy as np
 
 from hw import rplidar_wire as wire
 from hw.rplidar_capsules import Dense, Express, Ultra, UltraDense, ultra_offset_deg
 from hw.rplidar_nodes import Node
+from hw.sim.rplidar_units import UNITS, Mode
 from hw.sim.sight import Floats, Sight, Turntable, joined, solve_angles
 
-TURN_HZ = 10.0
 BANNER = "RP LIDAR System.\r\nFirmware Ver {}.{:02d} - rtm, HW Ver {}\r\nModel: {:x}\r\n"  # some hosts count its bytes
 BOOT_S = 0.05
+PATIENCE_S = 1.0  # for the rest of a request that has begun
 CAPSULES = {kind.type: kind for kind in (Express(), Dense(), Ultra(), UltraDense())}
-
-
-@dataclass(frozen=True, slots=True)
-class Mode:
-    """One entry of the list of scan modes."""
-
-    name: str
-    type: int
-    samples_per_s: int
-
-
-@dataclass(frozen=True, slots=True)
-class Unit:
-    """One model of the family."""
-
-    info: wire.Info
-    baud: int
-    range_max_m: float
-    modes: tuple[Mode, ...]
-    typical: int
-    turn_hz: float = TURN_HZ
-
-
-def _info(model: int, firmware: tuple[int, int], hardware: int) -> wire.Info:
-    return wire.Info(model, firmware, hardware, bytes(range(model, model + 16)))
-
-
-UNITS = {
-    "rplidar-a1": Unit(
-        _info(0x18, (1, 29), 7),
-        115200,
-        12.0,
-        (
-            Mode("Standard", wire.NODE_TYPE, 2000),
-            Mode("Express", wire.EXPRESS_TYPE, 4000),
-            Mode("Boost", wire.ULTRA_TYPE, 7680),
-        ),
-        typical=1,
-        turn_hz=5.0,
-    ),
-    "rplidar-c1": Unit(
-        _info(0x41, (1, 2), 18),
-        460800,
-        12.0,
-        (Mode("Standard", wire.NODE_TYPE, 5000), Mode("DenseBoost", wire.DENSE_TYPE, 5000)),
-        typical=1,
-    ),
-    "rplidar-s2": Unit(
-        _info(0x71, (1, 1), 18),
-        1000000,
-        30.0,
-        (
-            Mode("Standard", wire.NODE_TYPE, 8000),
-            Mode("DenseBoost", wire.DENSE_TYPE, 32000),
-            Mode("UltraDense", wire.ULTRA_DENSE_TYPE, 32000),
-        ),
-        typical=1,
-    ),
-}
 
 
 class RplidarSim:
@@ -89,6 +26,8 @@ class RplidarSim:
         self.baud = self.unit.baud
         self.health = wire.Health(0)
         self._inbox, self._outbox = bytearray(), bytearray()
+        self._heard_s = 0.0
+        self._turn_hz = self.unit.turn_hz
         self._mode: Mode | None = None
         self._head: Turntable | None = None
         self._is_first = False
@@ -116,6 +55,9 @@ class RplidarSim:
         """See `ByteDevice`."""
         if now_s < self._booted_s:
             return
+        if now_s - self._heard_s > PATIENCE_S:
+            self._inbox.clear()
+        self._heard_s = now_s
         self._inbox += data
         while self._inbox:
             request, used = wire.parse_request(self._inbox)
@@ -141,14 +83,28 @@ class RplidarSim:
             periods_us = (round(1e6 / mode.samples_per_s) for mode in self.unit.modes[:2])  # standard, express
             self._outbox += wire.answer(wire.SAMPLERATE_TYPE, struct.pack("<HH", *periods_us))
         elif command == wire.BOARD_FLAG_CMD:
-            self._outbox += wire.answer(wire.BOARD_FLAG_TYPE, struct.pack("<I", 0))
+            self._outbox += wire.answer(wire.BOARD_FLAG_TYPE, struct.pack("<I", self.unit.has_pwm))
         elif command == wire.GET_CONF_CMD and len(payload) >= 4:
             self._tell(*struct.unpack_from("<IH", payload + b"\0\0"))
+        elif command == wire.SET_CONF_CMD and len(payload) >= 4:
+            self._outbox += wire.answer(wire.CONF_SET_TYPE, payload[:4] + bytes(4))  # granted, and without effect
+        elif command == wire.RPM_CMD and len(payload) == 2:
+            self._set_speed(struct.unpack("<H", payload)[0] / 60.0, now_s)
         elif command in (wire.SCAN_CMD, 0x21):
             self._scan(self.unit.modes[0], now_s)
         elif command == wire.EXPRESS_CMD and payload:
             # A working mode of 0 is the express mode of units without a list of modes.
             self._scan(self.unit.modes[min(payload[0] or 1, len(self.unit.modes) - 1)], now_s)
+
+    def _set_speed(self, turn_hz: float, now_s: float) -> None:
+        """Turn slower or faster, within half and twice the usual; 0 rests the motor, which the next scan starts again."""
+        turn_hz = min(2 * self.unit.turn_hz, max(self.unit.turn_hz / 2, turn_hz)) if turn_hz > 0 else self._turn_hz
+        if turn_hz != self._turn_hz:
+            self._turn_hz = turn_hz
+            if self._mode is not None:
+                self._outbox += self._measured(now_s)
+                self._is_first, self._held = True, None
+                self._begin_turn(self._mode, now_s)
 
     def _reboot(self, now_s: float) -> None:
         self._mode, self.health = None, wire.Health(0)
@@ -178,15 +134,15 @@ class RplidarSim:
     def _scan(self, mode: Mode, now_s: float) -> None:
         if self.health.status >= 2:
             return
-        beams = round(mode.samples_per_s / self.unit.turn_hz)
-        per_frame, length = 1, 5
-        if mode.type in CAPSULES:
-            per_frame, length = CAPSULES[mode.type].samples, CAPSULES[mode.type].length
-            beams = round(beams / per_frame) * per_frame
         self._mode, self._is_first = mode, True
-        self._head = Turntable.in_frames(self.unit.turn_hz, beams, per_frame)
+        self._begin_turn(mode, now_s)
+        self._outbox += wire.Descriptor(wire.SCAN_LENGTHS[mode.type], True, mode.type).encode()
+
+    def _begin_turn(self, mode: Mode, now_s: float) -> None:
+        beams = round(mode.samples_per_s / self._turn_hz)
+        per_frame = CAPSULES[mode.type].samples if mode.type in CAPSULES else 1
+        self._head = Turntable.in_frames(self._turn_hz, round(beams / per_frame) * per_frame, per_frame)
         self._head.restart(now_s)
-        self._outbox += wire.Descriptor(length, True, mode.type).encode()
 
     def emit(self, now_s: float) -> bytes:
         """See `ByteDevice`."""

@@ -59,6 +59,37 @@ def test_an_rplidar_says_hello_when_it_has_booted_and_hears_nothing_before() -> 
     assert len(hello) == 64, "some hosts count them"
 
 
+@pytest.mark.parametrize(
+    "garbage", [b"\xa5", b"\xa5\xa5", b"\xa5\xff\xa5", b"\xa5\x82\xa5", b"\0\xa5\xb7", b"\xa5\x84\x02\0\xa5\x5a"]
+)
+def test_an_rplidar_hears_what_comes_behind_garbage(garbage: bytes) -> None:
+    lidar, question = RplidarSim("rplidar-a1", sight()), rplidar_wire.request(rplidar_wire.HEALTH_CMD)
+    health = rplidar_wire.answer(rplidar_wire.HEALTH_TYPE, bytes(3))
+    assert answer(lidar, garbage + question) == health
+
+
+def test_an_rplidar_forgets_half_a_request_and_takes_one_in_two_halves() -> None:
+    lidar, question = RplidarSim("rplidar-c1", sight()), rplidar_wire.conf_request(rplidar_wire.CONF_MODE_COUNT)
+    told = rplidar_wire.answer(rplidar_wire.CONF_TYPE, rplidar_wire.Conf(rplidar_wire.CONF_MODE_COUNT, b"\2\0").encode())
+    lidar.receive(question[:5], 5.0)
+    lidar.receive(question[5:], 5.5)
+    assert lidar.emit(5.5) == told
+    lidar.receive(question[:5], 6.0)
+    lidar.receive(question, 8.0)
+    assert lidar.emit(8.0) == told
+
+
+def test_an_rplidar_says_that_a_setting_is_taken_and_turns_as_fast_as_it_is_told() -> None:
+    lidar = RplidarSim("rplidar-s2", sight())
+    assert answer(lidar, rplidar_wire.request(0x85, bytes(6))) == rplidar_wire.answer(0x21, bytes(8))
+    lidar.receive(rplidar_wire.request(rplidar_wire.RPM_CMD, struct.pack("<H", 900)), 6.0)
+    lidar.receive(rplidar_wire.request(rplidar_wire.SCAN_CMD), 6.0)
+    nodes = np.frombuffer(lidar.emit(6.0)[7:] + b"".join(lidar.emit(6.0 + k / 100) for k in range(1, 41)), np.uint8).reshape(
+        -1, 5
+    )
+    assert np.count_nonzero(nodes[:, 0] & 1) == 6, "turns of 1/15 s, begun in 0.4 s"
+
+
 def test_an_rplidar_that_is_told_to_stop_has_measured_until_then() -> None:
     lidar = RplidarSim("rplidar-a1", sight())
     answer(lidar, rplidar_wire.request(rplidar_wire.SCAN_CMD))
