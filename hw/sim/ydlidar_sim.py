@@ -1,7 +1,4 @@
-"""A simulated YDLIDAR, one-way or two-way (SERIAL.md 3): its packets, and what it answers.
-
-What it is told of its speed is remembered and told again; the head goes on as it did.
-"""
+"""A simulated YDLIDAR, one-way or two-way (SERIAL.md 3): its packets, what it answers, and the speed it is told to turn at."""
 
 from __future__ import annotations
 
@@ -27,7 +24,10 @@ class YdlidarUnit:
 
 
 SPEED_STEPS_HZ = {0x0D: 0.0, 0x09: 0.1, 0x0A: -0.1, 0x0B: 1.0, 0x0C: -1.0}  # tell the speed aimed at; more, less
-GET_RATE, SET_RATE, ZERO_ANGLE, HEARTBEAT = 0xD1, 0xD0, 0x93, 0xD9
+LEAST_HZ, MOST_HZ = 5.0, 12.0
+GET_RATE, SET_RATE, ZERO_ANGLE = 0xD1, 0xD0, 0x93
+# told in one byte: low power, ways to turn, constant speed, exposure, heartbeat; nothing here shows their effect
+SWITCHES = {0x01: 1, 0x02: 0, 0x06: 0, 0x07: 1, 0x0E: 1, 0x0F: 0, 0x94: 0, 0x95: 0, 0x96: 1, 0x97: 0, 0xD9: 0}
 OLD_HEALTH, OLD_RESET = 0x91, 0x40  # what hosts written for the first X4 and G4 send
 YDLIDARS = {"x2": YdlidarUnit(6, 3000, 6.0, 2), "x4": YdlidarUnit(6, 5000, 8.0, 2), "g2": YdlidarUnit(15, 5000, 10.0, 3)}
 
@@ -38,11 +38,14 @@ class YdlidarSim:
     def __init__(self, model: str, sight: Sight) -> None:
         self._model, self._unit, self._sight = ydlidar_wire.MODELS[model], YDLIDARS[model], sight
         self.baud = self._model.baud
-        self._head = Turntable.in_frames(self._unit.turn_hz, round(self._unit.samples_per_s / self._unit.turn_hz), 40)
+        self._turn_at(self._unit.turn_hz)
         self._is_sending = not self._model.is_two_way
         self._inbox, self._outbox = bytearray(), bytearray()
         self._status = 0
-        self._aim_hz = self._unit.turn_hz
+
+    def _turn_at(self, turn_hz: float) -> None:
+        self._turn_hz = turn_hz
+        self._head = Turntable.in_frames(turn_hz, round(self._unit.samples_per_s / turn_hz), 40)
 
     def fault(self, kind: str, value: float, now_s: float) -> None:
         """Misbehave: `health` reports a fault for good, `shift` of the head in turns."""
@@ -57,7 +60,7 @@ class YdlidarSim:
             return
         self._inbox += data
         while len(self._inbox) >= 2:
-            if self._inbox[0] == 0xA5:
+            if self._inbox[0] == 0xA5 != self._inbox[1]:
                 self._obey(self._inbox[1], now_s)
                 del self._inbox[:2]
             else:
@@ -72,18 +75,21 @@ class YdlidarSim:
         elif code in (ydlidar_wire.HEALTH, OLD_HEALTH):
             self._outbox += ydlidar_wire.answer(ydlidar_wire.HEALTH_TYPE, bytes((self._status, 0, 0)))
         elif code in SPEED_STEPS_HZ:
-            self._aim_hz = min(12.0, max(5.0, self._aim_hz + SPEED_STEPS_HZ[code]))
-            self._tell(struct.pack("<I", round(100 * self._aim_hz)))
+            aim_hz = round(min(MOST_HZ, max(LEAST_HZ, self._turn_hz + SPEED_STEPS_HZ[code])), 1)
+            if aim_hz != self._turn_hz:
+                self._turn_at(aim_hz)
+            self._tell(struct.pack("<I", round(100 * aim_hz)))
         elif code in (GET_RATE, SET_RATE):
             self._tell(bytes((self._unit.rate_code,)))
         elif code == ZERO_ANGLE:
             self._tell(bytes(4))
-        elif code == HEARTBEAT:
-            self._tell(b"\0")
+        elif code in SWITCHES:
+            self._tell(bytes((SWITCHES[code],)))
         elif code in (ydlidar_wire.SCAN, 0x61):
             self._outbox += Descriptor(5, True, ydlidar_wire.SCAN_TYPE).encode()
+            if not self._is_sending:  # else it is a host's heartbeat
+                self._head.restart(now_s)
             self._is_sending = True
-            self._head.restart(now_s)
 
     def _tell(self, body: bytes) -> None:
         """Answer a question about its settings; all are of the type of the device information."""
@@ -104,7 +110,7 @@ class YdlidarSim:
         return out + b"".join(self._packet(a, d) for a, d in zip(np.split(q6, cuts), np.split(mm, cuts), strict=True))
 
     def _packet(self, q6: Floats, mm: Floats) -> bytes:
-        width, hz = self._unit.sample_bytes, self._unit.turn_hz
+        width, hz = self._unit.sample_bytes, self._turn_hz
         intensities = (120,) * len(mm) if width > 2 else ()
         words = tuple(int(4 * v) for v in mm)
         packet = ydlidar_wire.encode(ydlidar_wire.Packet(False, 0.0, int(q6[0]), int(q6[-1]), words, intensities), width)

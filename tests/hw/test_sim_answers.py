@@ -35,11 +35,29 @@ def test_a_ydlidar_tells_its_health_by_the_old_command_and_the_new(question: int
 
 @pytest.mark.parametrize(("code", "body"), [
     (0x0D, struct.pack("<I", 800)), (0x09, struct.pack("<I", 810)), (0x0C, struct.pack("<I", 700)),
-    (0xD1, b"\0"), (0xD0, b"\0"), (0x93, bytes(4)), (0xD9, b"\0"),
+    (0xD1, b"\0"), (0xD0, b"\0"), (0x93, bytes(4)), (0xD9, b"\0"), (0x01, b"\1"), (0x0F, b"\0"),
 ])  # fmt: skip
 def test_a_ydlidar_tells_its_settings(code: int, body: bytes) -> None:
     said = answer(YdlidarSim("x4", sight()), ydlidar_wire.command(code))
     assert said == ydlidar_wire.answer(ydlidar_wire.INFO_TYPE, body)
+
+
+def starts(stream: bytes) -> int:
+    """How many turns begin in it."""
+    return stream.count(b"\xaa\x55\xa1\x01") + stream.count(b"\xaa\x55\xc9\x01")
+
+
+def test_a_ydlidar_turns_as_fast_as_it_is_told_and_takes_a_second_order_to_scan_for_a_heartbeat() -> None:
+    lidar, scan = YdlidarSim("x4", sight()), ydlidar_wire.command(ydlidar_wire.SCAN)
+    usual = answer(lidar, scan, 0.01) + b"".join(lidar.emit(5.0 + k / 100) for k in range(2, 48))
+    assert starts(usual) == 4, "8 a second"
+    lidar.receive(b"\xa5" + scan, 5.48)
+    assert starts(b"".join(lidar.emit(5.48 + k / 100) for k in range(25))) == 2, "behind a stray A5, and without a jump"
+    for _ in range(2):
+        lidar.receive(ydlidar_wire.command(0x0B), 6.0)
+    faster = answer(lidar, ydlidar_wire.command(ydlidar_wire.STOP)) + answer(lidar, scan, 0.01)
+    faster += b"".join(lidar.emit(5.0 + k / 100) for k in range(2, 48))
+    assert starts(faster) == 5, "10 a second"
 
 
 @pytest.mark.parametrize(("key", "value"), [
