@@ -25,6 +25,8 @@ from protocol.grid import OccupancyGrid
 
 READY_WITHIN_S = 30.0
 STOP_WITHIN_S = 4.0
+CROWD_A_CORE = 2  # robots; with more of them a core is always wanted by somebody
+CROWD_NICENESS = 10
 
 
 def child_environment(folder: Path) -> dict[str, str]:
@@ -36,6 +38,11 @@ def child_environment(folder: Path) -> dict[str, str]:
     places = dict.fromkeys(("XDG_RUNTIME_DIR", "XDG_STATE_HOME"), str(folder))
     bytecode = {"PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": str(folder / "bytecode")} if sys.dont_write_bytecode else {}
     return {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MAPQUILT_CONFIG": os.devnull, **places, **bytecode}
+
+
+def niceness(robots: int) -> int:
+    """Of each of so many robots here: simulated devices keep their pace, as hardware does, even if all robots want the cores."""
+    return CROWD_NICENESS if robots > CROWD_A_CORE * (os.cpu_count() or 1) else 0
 
 
 class ChildError(Exception):
@@ -52,6 +59,7 @@ class AgentProcess:
         folder: Path,
         environment: Mapping[str, str] | None = None,
         command: str = "run",
+        niceness: int = 0,
     ) -> None:
         self.robot = robot
         self.log_path = folder / f"{robot}.log"
@@ -65,6 +73,8 @@ class AgentProcess:
             env={**os.environ, **child_environment(folder), **(environment or {})},
             start_new_session=True,
         )
+        if niceness:
+            os.setpriority(os.PRIO_PROCESS, self.process.pid, os.getpriority(os.PRIO_PROCESS, 0) + niceness)
         self.ready: dict[str, Any] = {}
 
     def wait_ready(self, within_s: float = READY_WITHIN_S) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from agent.commands.children import AgentProcess, ChildError, stop_all
+from agent.commands.children import AgentProcess, ChildError, niceness, stop_all
 from agent.commands.demo_stage import Stage
 from agent.runtime.control import ControlError
 
@@ -32,7 +32,8 @@ class Fleet:
         for i, robot in enumerate(self.stage.robots):
             page = ["--view-port", "8080"] if i == 0 else ["--no-view"]
             common = ["--fleet", name, "--no-state", "--set", f"mapping.seed={i}", *page]
-            self.agents.append(AgentProcess(robot.name, [*robot.arguments(), *common, *seeds], self.folder))
+            words = [*robot.arguments(), *common, *seeds]
+            self.agents.append(AgentProcess(robot.name, words, self.folder, niceness=niceness(len(self.stage.robots))))
             if i == 0:
                 ready = self.agents[0].wait_ready()
                 seeds = ["--connect", ready["locators"][0]]

@@ -13,6 +13,7 @@ import time
 from collections import Counter
 from typing import Any
 
+from agent.commands.children import niceness
 from tests.bench.tables import print_row
 from tests.harness.fleet import Fleet
 from tests.harness.processes import own_share_mb, resident_mb
@@ -35,7 +36,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def campaign(args: argparse.Namespace) -> dict[str, Any]:
-    with Fleet() as fleet:
+    with Fleet(niceness(args.robots)) as fleet:
         stage = fleet.stage(args.world, robots=args.robots, seed=args.seed)
         for actor in stage.robots:
             fleet.start(actor, arguments=["--set", f"mapping.particles={args.particles}", "--no-state"])

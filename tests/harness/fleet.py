@@ -31,7 +31,8 @@ _numbers = itertools.count()
 class Fleet:
     """Robots that know one another by the first one's address (or by `connect`).  One fleet name per test."""
 
-    def __init__(self) -> None:
+    def __init__(self, niceness: int = 0) -> None:
+        self._niceness = niceness
         self._stack = contextlib.ExitStack()
         self.name = f"test-{os.getpid()}-{next(_numbers)}"
         self.agents: dict[str, AgentProcess] = {}
@@ -67,7 +68,7 @@ class Fleet:
         )
         connections = [part for locator in dial for part in ("--connect", locator)]
         common = ["--fleet", self.name, "--no-view", *connections, *arguments]
-        agent = AgentProcess(actor.name, [*actor.arguments(), *common], self.folder, environment)
+        agent = AgentProcess(actor.name, [*actor.arguments(), *common], self.folder, environment, niceness=self._niceness)
         previous, self.agents[actor.name] = self.agents.get(actor.name), agent
         assert previous is None or not previous.is_running
         agent.wait_ready()
