@@ -9,10 +9,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from hw import scip
-from hw.sim.sight import Part, Sight, Turntable
+from hw.sim.hokuyo_requests import ScanRequest, scan_request, tag_fault
+from hw.sim.sight import Floats, Part, Sight, Turntable
 
 MODELS = {"hokuyo-urg": scip.URG_04LX, "hokuyo-utm": scip.UTM_30LX}
-_SCAN = re.compile(rb"([MG])([DSE])(\d{4})(\d{4})(\d{2})(?:(\d)(\d{2}))?$")
 _REFUSED = b"10"
 BOOT_S = 1.0
 _TIME_STATUS = {(b"TM0", True): b"02", (b"TM1", False): b"04", (b"TM2", False): b"03"}  # (command, is the clock being read): no
@@ -28,11 +28,11 @@ class HokuyoSim:
         self._inbox, self._outbox = bytearray(), bytearray()
         sweep = (parameters.first_step, parameters.last_step + 1)
         self._head = Turntable(parameters.rpm / 60.0, parameters.steps_per_turn, [sweep])
-        self._echo = b""  # of the running stream
+        self._stream: ScanRequest | None = None
         self._left: int | None = None  # scans still to send; None: for ever
-        self._skip = self._skipped = 0
+        self._skipped = 0
         self._begun_s = 0.0
-        self._once: list[bytes] = []  # GD requests waiting for the next sweep
+        self._once: list[ScanRequest] = []  # single scans wait for the next sweep
         self._is_laser_on = False
         self._is_timing = False
         self._booting_until_s = self._asked_to_reboot_s = -math.inf
@@ -41,7 +41,7 @@ class HokuyoSim:
     def fault(self, kind: str, value: float, now_s: float) -> None:
         """Misbehave: `booting` for so many seconds, `clock` jumps by so many seconds, `shift` of the head in turns."""
         if kind == "booting":
-            self._booting_until_s, self._is_laser_on, self._echo = now_s + value, False, b""
+            self._booting_until_s, self._is_laser_on, self._stream = now_s + value, False, None
         elif kind == "clock":
             self._clock_offset_s += value
         elif kind == "shift":
@@ -61,8 +61,10 @@ class HokuyoSim:
 
     def _obey(self, line: bytes, now_s: float) -> None:
         command = line.partition(b";")[0]
-        if match := _SCAN.match(command):
-            self._scan(line, match, now_s)
+        if fault := tag_fault(line):
+            self._say(line, fault)
+        elif (request := scan_request(line, self.parameters.last_step)) is not None:
+            self._scan(line, request, now_s)
         elif command == b"PP":
             self._say(line, texts=self.parameters.lines())
         elif command == b"VV":
@@ -72,7 +74,7 @@ class HokuyoSim:
         elif command == b"BM":
             self._laser_on(line, now_s)
         elif command in (b"QT", b"RS", b"RT"):
-            self._is_laser_on, self._echo, self._is_timing = False, b"", False
+            self._is_laser_on, self._stream, self._is_timing = False, None, False
             self._once.clear()
             self._next_baud = self._first_baud if command == b"RS" else self.baud
             self._say(line)
@@ -104,10 +106,10 @@ class HokuyoSim:
             "MODL": self.parameters.model,
             "LASR": "ON" if self._is_laser_on else "OFF",
             "SCSP": f"Initial({self.parameters.rpm}[rpm])",
-            "MESM": "Measuring by Normal" if self._echo else "IDLE",
+            "MESM": "Measuring by Normal" if self._stream else "IDLE",
             "SBPS": f"{self.baud}[bps]" if self.baud else "USB only",
             "TIME": f"{self._clock_ms(now_s):06X}",
-            "STAT": "Sensor works well.",
+            "STAT": "Stable 000 no error." if self.parameters is scip.UTM_30LX else "Sensor works well.",
         }
         return [f"{key}:{value};".encode() for key, value in told.items()]
 
@@ -115,7 +117,7 @@ class HokuyoSim:
         """0 standby, 1 booting, 2 time mode, 3 single scans, 4 a stream."""
         if now_s < self._booting_until_s:
             return 1
-        return 2 if self._is_timing else 4 if self._echo else 3 if self._is_laser_on else 0
+        return 2 if self._is_timing else 4 if self._stream else 3 if self._is_laser_on else 0
 
     def _time(self, line: bytes, command: bytes, now_s: float) -> None:
         refusal = _TIME_STATUS.get((command, self._is_timing))
@@ -141,25 +143,20 @@ class HokuyoSim:
         self._say(line, b"02" if self._is_laser_on else b"00")
         self._is_laser_on = True
 
-    def _scan(self, line: bytes, match: re.Match[bytes], now_s: float) -> None:
-        first, last = int(match[3]), int(match[4])
-        if last > self.parameters.last_step or last < first:
-            self._say(line, b"04" if last > self.parameters.last_step else b"05")
+    def _scan(self, line: bytes, request: ScanRequest | bytes, now_s: float) -> None:
+        if isinstance(request, bytes):
+            self._say(line, request)
         elif now_s < self._booting_until_s:
             self._say(line, _REFUSED)
-        elif match[1] == b"G" and match[6] is None:
-            if self._is_laser_on and not self._echo:
-                self._once.append(line)
-            else:
-                self._say(line, _REFUSED)
-        elif match[1] == b"G" or match[6] is None:
-            self._say(line, b"0D" if match[1] == b"G" else b"0C")
-        else:
+        elif request.is_stream:
             self._say(line)
-            count = int(match[7])
-            self._echo, self._left = line, count or None
-            self._skip, self._skipped, self._is_laser_on = int(match[6]), 0, True
+            self._stream, self._left = request, request.count or None
+            self._skipped, self._is_laser_on = 0, True
             self._begun_s = now_s  # the sweep that is under way is not sent
+        elif self._is_laser_on and not self._stream:
+            self._once.append(request)
+        else:
+            self._say(line, _REFUSED)
 
     def emit(self, now_s: float) -> bytes:
         """See `ByteDevice`; a new bit rate holds from behind the answer that grants it."""
@@ -169,45 +166,44 @@ class HokuyoSim:
             self.baud = self._next_baud
         for sweep in self._head.due(now_s):
             if self._once and self._is_laser_on:
-                out += b"".join(self._message(line, sweep, None) for line in self._once)
+                out += b"".join(self._message(request, sweep, None) for request in self._once)
                 self._once.clear()
-            if self._echo and sweep.times_s[0] >= self._begun_s and self._is_due():
-                out += self._message(self._echo, sweep, self._left)
+            if self._stream and sweep.times_s[0] >= self._begun_s and self._is_due(self._stream.skip):
+                out += self._message(self._stream, sweep, self._left)
                 if self._left == 0:
-                    self._echo = b""
+                    self._stream = None
         return bytes(out)
 
-    def _is_due(self) -> bool:
+    def _is_due(self, skip: int) -> bool:
         self._skipped += 1
-        if self._skipped <= self._skip:
+        if self._skipped <= skip:
             return False
         self._skipped = 0
         self._left = None if self._left is None else self._left - 1
         return True
 
-    def _message(self, line: bytes, sweep: Part, left: int | None) -> bytes:
-        command, semicolon, tag = line.partition(b";")
-        match = _SCAN.match(command)
-        assert match is not None
-        first, last, cluster = int(match[3]), int(match[4]), max(1, int(match[5]))
+    def _message(self, request: ScanRequest, sweep: Part, left: int | None) -> bytes:
         p = self.parameters
-        is_asked = (sweep.index >= first) & (sweep.index <= last)
+        is_asked = (sweep.index >= request.first) & (sweep.index <= request.last)
         step, times_s = sweep.index[is_asked], sweep.times_s[is_asked]
         angles_rad = (step - p.front_step).astype(np.float64) * (math.tau / p.steps_per_turn)
-        mm = self._sight.distances_mm(times_s, angles_rad, p.range_min_mm / 1e3, p.range_max_mm / 1e3).astype(int)
-        n = (last - first) // cluster + 1
-        values = [int(v) for v in mm[: n * cluster : cluster]][:n]
-        if match[2] == b"S":
+        mm = self._sight.distances_mm(times_s, angles_rad, p.range_min_mm / 1e3, p.range_max_mm / 1e3)
+        values = _nearest(mm, request.cluster)
+        if request.kind == b"S":
             values = [min(v, 4095) for v in values]
-        intensities = [1000] * len(values) if match[2] == b"E" else None
-        if left is not None and match[1] == b"M":
-            command = command[:-2] + b"%02d" % left
+        intensities = [1000] * len(values) if request.kind == b"E" else None
         # The sensor's clock is read when its beam passes step 0.
         zero_s = float(sweep.times_s[0]) - p.first_step * 60.0 / p.rpm / p.steps_per_turn
-        return scip.encode_scan(command + semicolon + tag, self._clock_ms(zero_s), values, intensities)
+        return scip.encode_scan(request.echo(left), self._clock_ms(zero_s), values, intensities)
 
     def _clock_ms(self, time_s: float) -> int:
         return int((time_s + self._clock_offset_s) * 1e3) % 2**24
+
+
+def _nearest(mm: Floats, cluster: int) -> list[int]:
+    """The least distance of each so many neighbouring steps; 0 where all see nothing."""
+    seen = np.minimum.reduceat(np.where(mm > 0, mm, np.inf), np.arange(0, len(mm), cluster))
+    return [int(v) if v < np.inf else 0 for v in seen]
 
 
 def _version() -> list[bytes]:

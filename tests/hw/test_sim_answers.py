@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 
 import numpy as np
@@ -121,6 +122,36 @@ def test_a_hokuyo_reboots_when_it_is_told_twice() -> None:
     assert answer(lidar, b"RB\n") == scip.encode_message(b"RB", b"01")
     assert answer(lidar, b"RB\n") == scip.encode_message(b"RB", b"00")
     assert answer(lidar, b"BM\n") == scip.encode_message(b"BM", b"10"), "it boots"
+
+
+@pytest.mark.parametrize(("line", "status"), [
+    (b"MD00xx0725010000", b"0D"), (b"MD00x40725010000"[:15], b"01"), (b"MD0044072x01000", b"02"), (b"MD00440725x1000", b"03"),
+    (b"MD0044072501x00", b"06"), (b"MD00440725010x0", b"07"), (b"MD0044076801000", b"04"), (b"MD0700004401000", b"05"),
+    (b"MD004407250100", b"0C"), (b"GD004407250", b"0C"), (b"GD0044072501", b"10"), (b"XY", b"0E"),
+    (b"VV;" + 17 * b"a", b"0G"), (b"VV;a\x01", b"0H"),
+])  # fmt: skip
+def test_a_hokuyo_says_what_is_wrong_with_a_request(line: bytes, status: bytes) -> None:
+    assert answer(HokuyoSim(HOKUYOS["hokuyo-urg"], sight()), line + b"\n", 0.0) == scip.encode_message(line, status)
+
+
+def test_a_hokuyo_tells_the_nearest_of_a_cluster_and_counts_down() -> None:
+    lidar = HokuyoSim(HOKUYOS["hokuyo-urg"], sight())
+    answer(lidar, b"BM\n", 0.0)
+    lidar.receive(b"GD0044072501\n", 5.0)
+    (fine,) = scans(b"".join(lidar.emit(5.0 + k / 50) for k in range(6)))
+    lidar.receive(b"MD0044072504002;tag\n", 5.2)
+    said = b"".join(lidar.emit(5.2 + k / 50) for k in range(25))
+    coarse, again = scans(said)
+    assert [scip.decode_message(b).echo[-6:] for b in said.split(b"\n\n")[:-1]] == [b"02;tag", b"01;tag", b"00;tag"]  # type: ignore[union-attr]
+    assert len(coarse) == math.ceil(682 / 4)
+    assert coarse == again == [min(fine[k : k + 4]) for k in range(0, 682, 4)]
+
+
+def scans(said: bytes) -> list[list[int]]:
+    """The distances of each scan in what a Hokuyo said."""
+    messages = [scip.decode_message(block) for block in said.split(b"\n\n")[:-1]]
+    found = [scip.scan_of(message) for message in messages if message is not None]
+    return [scan.values.tolist() for scan in found if scan is not None]
 
 
 def told(scanner: SickSim, payload: bytes) -> bytes:
