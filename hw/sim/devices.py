@@ -10,6 +10,7 @@ from typing import Protocol
 
 from hw import sick_lms, wheels
 
+PART_OF_TELEGRAM_S = 0.3  # half a telegram is forgotten: a SICK waits 14 ms for each byte, and a busy computer adds to that
 LATE_S = 0.5  # a host that did not look for longer missed the rest: a serial line keeps nothing
 
 
@@ -73,6 +74,10 @@ class Wt1Board:
         return wheels.encode(self._source.info) + frame if is_info_due else frame
 
 
+SICK_TYPE = b"LMS291;S05;V02.10"
+NOT_UNDERSTOOD = b"\x92\x10"
+
+
 class ScanSource(Protocol):
     """Scans in centimetres for a SICK, each at its moment."""
 
@@ -90,9 +95,13 @@ class SickScanner:
         self._inbox = bytearray()
         self._outbox = bytearray()
         self._is_sending = False
+        self._heard_s = 0.0
 
     def receive(self, data: bytes, now_s: float) -> None:
-        """Answer every whole telegram in what the host wrote so far."""
+        """Answer every whole telegram in what the host wrote so far; one that is damaged is told so."""
+        if now_s - self._heard_s > PART_OF_TELEGRAM_S:
+            self._inbox.clear()
+        self._heard_s = now_s
         self._inbox += data
         del self._inbox[:-4096]
         while (start := self._inbox.find(sick_lms.STX)) >= 0 and len(self._inbox) >= start + 4:
@@ -102,7 +111,9 @@ class SickScanner:
                 return
             decoded = sick_lms.decode(telegram) if size <= 64 else None
             del self._inbox[: start + (size if decoded else 1)]
-            if decoded:
+            if decoded is None and 7 <= size <= 64 and telegram[1] == sick_lms.HOST_ADDRESS:
+                self._outbox.append(sick_lms.NAK)
+            elif decoded:
                 self._outbox += bytes((sick_lms.ACK,)) + sick_lms.encode(self._answer(decoded[1]), sick_lms.SCANNER_ADDRESS)
 
     def _answer(self, payload: bytes) -> bytes:
@@ -116,8 +127,9 @@ class SickScanner:
             return b"\xa0\x00\x10"
         if payload[0] == sick_lms.VARIANT:
             return b"\xbb\x01" + payload[1:] + b"\x10"
-        body = b"LMS291;S05;V02.10" if payload == sick_lms.TYPE else b""
-        return bytes((payload[0] | 0x80,)) + body + b"\x10"
+        if payload in (sick_lms.STATUS, sick_lms.ERRORS):
+            return bytes((payload[0] | 0x80,)) + b"\x10"
+        return b"\xba" + SICK_TYPE + b"\x10" if payload == sick_lms.TYPE else NOT_UNDERSTOOD
 
     def emit(self, now_s: float) -> bytes:
         """See `ByteDevice`."""

@@ -8,12 +8,11 @@ import struct
 import numpy as np
 import pytest
 
-from hw import rplidar_wire, scip, sick_lms, ydlidar_wire
+from hw import rplidar_wire, scip, ydlidar_wire
 from hw.sim.catalogue import HOKUYOS
 from hw.sim.hokuyo_sim import HokuyoSim
 from hw.sim.obedient import ObedientRobot
 from hw.sim.rplidar_sim import RplidarSim
-from hw.sim.sick_sim import SickSim
 from hw.sim.sight import Sight
 from hw.sim.ydlidar_sim import YdlidarSim
 from tests.harness.serial_device import POSE, ROOM
@@ -152,57 +151,3 @@ def scans(said: bytes) -> list[list[int]]:
     messages = [scip.decode_message(block) for block in said.split(b"\n\n")[:-1]]
     found = [scip.scan_of(message) for message in messages if message is not None]
     return [scan.values.tolist() for scan in found if scan is not None]
-
-
-def told(scanner: SickSim, payload: bytes) -> bytes:
-    """The payload of the answer, behind the byte that acknowledges the request."""
-    said = answer(scanner, sick_lms.encode(payload), 0.0)
-    size = 7 + (said[3] | said[4] << 8)
-    decoded = sick_lms.decode(said[1:size])
-    assert said[0] == sick_lms.ACK and decoded is not None
-    return decoded[1]
-
-
-def test_a_sick_tells_what_it_is_and_how_it_is_set() -> None:
-    scanner = SickSim(sight())
-    assert told(scanner, sick_lms.TYPE)[1:11] == b"LMS291;S05"
-    assert told(scanner, b"\x32") == b"\xb2\x10", "none"
-    told(scanner, sick_lms.variant_request(100, 0.25))
-    status = told(scanner, sick_lms.STATUS)
-    assert struct.unpack_from("<HH", status, 107) == (100, 25)
-    assert (status[8], status[122]) == (0x25, 1), "polled, in millimetres"
-
-
-def test_a_sick_changes_its_unit_only_behind_its_password() -> None:
-    scanner = SickSim(sight())
-    config = bytearray(told(scanner, bytes((sick_lms.GET_CONFIG,)))[1:-1])
-    assert len(config) == 34
-    config[6] = 0
-    wish = bytes((sick_lms.SET_CONFIG,)) + config
-    assert told(scanner, wish)[1] == 0
-    assert told(scanner, sick_lms.INSTALL[:-1] + b"X") == b"\xa0\x01\x10"
-    assert told(scanner, sick_lms.INSTALL) == b"\xa0\x00\x10"
-    assert told(scanner, wish)[1:-1] == b"\x01" + bytes(config)
-    scan = sick_lms.ScanPayload.decode(told(scanner, sick_lms.ONE_SCAN))
-    assert scan is not None and not scan.is_mm
-
-
-def test_a_sick_answers_a_poll_with_a_scan_and_refuses_a_mode_it_has_not() -> None:
-    scanner = SickSim(sight())
-    scan = sick_lms.ScanPayload.decode(told(scanner, sick_lms.ONE_SCAN))
-    assert scan is not None and len(scan.values) == 361
-    assert told(scanner, b"\x20\x2e") == b"\xa0\x02\x10"
-
-
-def test_the_parts_of_a_sick_scan_are_the_scan() -> None:
-    scanner = SickSim(sight())
-    whole = sick_lms.ScanPayload.decode(told(scanner, sick_lms.ONE_SCAN))
-    told(scanner, bytes((sick_lms.MODE, sick_lms.RATE_CODES[500000])))
-    told(scanner, sick_lms.PARTIAL)
-    scanner.emit(5.0)
-    stream = scanner.emit(5.1)
-    first = struct.unpack_from("<H181H", stream, 5)
-    second = struct.unpack_from("<H180H", stream, 10 + 2 * 181 + 5)
-    assert (first[0], second[0]) == (181 | 0x6000, 180 | 0x6000 | 2 << 11)
-    assert whole is not None
-    assert np.array_equal(first[1:], whole.values[0::2]) and np.array_equal(second[1:], whole.values[1::2])
