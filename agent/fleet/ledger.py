@@ -35,6 +35,7 @@ class Ledger:
         self._layout = Layout()
         self._connected = {robot}  # everybody whom a chain of live edges joins to us, when the layout was solved
         self._is_layout_old = False
+        self._rejected: frozenset[bytes] | None = None  # None: not asked for since the edges changed
         self.effects: list[Effect] = []
         self.clock, self.timetable = Clock(), Timetable()
         self.counts: dict[str, int] = {}
@@ -122,6 +123,7 @@ class Ledger:
                 self.note("merged", a=key[0], b=key[1], match_factor=evidence.match_factor, T_a_b=(T.x_m, T.y_m, T.theta_rad))
             self.live[key], e = evidence, evidence
             self._edges[key] = Edge(e.robot_a, e.robot_b, e.T_a_b, e.covariance, e.overlap_m2 * e.match_factor, e.id())
+        self._rejected = None
         if a in self._connected or b in self._connected:
             self._is_layout_old = True
             self.timetable.next_scan_s = now_s
@@ -135,9 +137,11 @@ class Ledger:
         for other in others:
             self.judge_pair(robot, other, now_s)
 
-    def rejected(self) -> set[bytes]:
+    def rejected(self) -> frozenset[bytes]:
         """Ids of the live edges of any group that contradict the others."""
-        return {edge.id for edge in solve(self._edges.values()).rejected}
+        if self._rejected is None:
+            self._rejected = frozenset(edge.id for edge in solve(self._edges.values()).rejected)
+        return self._rejected
 
     def _solve(self) -> None:
         """Solve the frames anew, and name the edges that came to contradict the others."""
