@@ -40,7 +40,7 @@ class ArduinoBridgeSim(Base):
         if code == b"e":
             return arduino_bridge.encode_counts(*self.counting.at(now_s))
         if code == b"b":
-            return b" %d\r\n" % self.baud
+            return b"%d\r\n" % self.baud
         if code == b"r":
             self.counting.fault("encoder-reset", 0, now_s)
             return OK

@@ -21,6 +21,10 @@ _LENGTHS = {129: 2, 137: 5, 138: 2, 139: 4, 141: 2, 142: 2, 144: 4, 145: 5, 146:
 _LENGTHS |= {167: 16, 168: 4}  # of a command with its operands; those not here are one byte long
 _VALUES = {22: 15000, 23: -250, 24: 25, 25: 2500, 26: 2696, 34: 0, 58: 2}  # mV, mA, degrees, mAh, mAh, sources, stasis
 _DRIVE, _DRIVE_DIRECT, _DRIVE_PWM = 137, 145, 146
+_START_BAUD, _BAUD = 115200, 129
+_RATES = (300, 600, 1200, 2400, 4800, 9600, 14400, 19200, 28800, 38400, 57600, 115200)
+_DISTANCE, _ANGLE = 19, 20  # each since it was last told
+_SPEED_TOLD, _RADIUS_TOLD, _RIGHT_TOLD, _LEFT_TOLD = 39, 40, 41, 42
 _FULL_MM_S = 500.0  # at a PWM of 255
 ANSWER_S = 0.008  # of the 15 ms it may take; some hosts clear their input right after they have asked
 _BOOT = ((0.0, b"Soft reset!\n"), (1.0, b"\xfe"), (3.0, b"Roomba by iRobot!\r\nstm32\r\n"))  # seconds after RESET
@@ -29,11 +33,12 @@ _BOOT = ((0.0, b"Soft reset!\n"), (1.0, b"\xfe"), (3.0, b"Roomba by iRobot!\r\ns
 class Create2Sim(Streaming):
     """`ByteDevice`."""
 
-    baud = 115200
-
     def __init__(self, counting: Counting) -> None:
         super().__init__(counting, 0.015)
+        self.baud = _START_BAUD
         self._mode = OFF
+        self._wishes: dict[int, int] = {}  # the last command to drive, as the packets 39 to 42 tell it
+        self._told = {_DISTANCE: 0, _ANGLE: 0}  # mm and degrees, until the last answer
         self._stream: list[int] = []
         self._is_streaming = False
         self._said: list[tuple[float, bytes]] = []  # when, and what
@@ -61,6 +66,7 @@ class Create2Sim(Streaming):
         code = command[0]
         self._mode = _MODES.get(code, self._mode)
         if code in _MODES and self._mode in (OFF, PASSIVE):
+            self._wishes = {}
             self._drive(0, 0, now_s)
         if code == create2.STREAM:
             self._stream = [p for p in command[2:] if p in create2.SIZES or p in create2.GROUPS]
@@ -70,7 +76,10 @@ class Create2Sim(Streaming):
         elif code in (_QUERY, _QUERY_LIST):
             asked = command[1:] if code == _QUERY else command[2:]
             self._said.append((now_s + ANSWER_S, self._answer(asked, now_s)))
+        elif code == _BAUD:
+            self.baud = _RATES[command[1]] if command[1] < len(_RATES) else self.baud
         elif code == _RESET:
+            self.baud = _START_BAUD
             self._mode, self._is_streaming = OFF, False
             self._drive(0, 0, now_s)
             self._said = [(now_s + later_s, text) for later_s, text in _BOOT]
@@ -79,6 +88,9 @@ class Create2Sim(Streaming):
             self._is_streaming = False
         elif code in (_DRIVE, _DRIVE_DIRECT, _DRIVE_PWM) and self._mode in (SAFE, FULL):
             first, second = struct.unpack(">hh", command[1:])
+            self._wishes = (
+                {_SPEED_TOLD: first, _RADIUS_TOLD: second} if code == _DRIVE else {_RIGHT_TOLD: first, _LEFT_TOLD: second}
+            )
             self._drive(*_wheels_mm_s(code, first, second), now_s)
 
     def _drive(self, left_mm_s: float, right_mm_s: float, now_s: float) -> None:
@@ -92,8 +104,25 @@ class Create2Sim(Streaming):
 
     def _values(self, time_s: float, packets: list[int]) -> dict[int, int]:
         left, right = self.counting.at(time_s)
-        known = {**_VALUES, create2.LEFT_ENCODER: left, create2.RIGHT_ENCODER: right, 35: self._mode, 38: len(self._stream)}
+        known = {
+            **_VALUES,
+            **self._wishes,
+            **self._since_told(packets, left, right),
+            create2.LEFT_ENCODER: left,
+            create2.RIGHT_ENCODER: right,
+            35: self._mode,
+            38: len(self._stream),
+        }
         return {p: known.get(p, 0) for p in packets}
+
+    def _since_told(self, packets: list[int], left: int, right: int) -> dict[int, int]:
+        """Way and turn since each was asked for."""
+        way_mm = 1e3 * create2.METRES_PER_TICK * (left + right) / 2
+        turn_deg = math.degrees(create2.METRES_PER_TICK * (right - left) / create2.TRACK_M)
+        now = {packet: value for packet, value in ((_DISTANCE, round(way_mm)), (_ANGLE, round(turn_deg))) if packet in packets}
+        since = {packet: value - self._told[packet] for packet, value in now.items()}
+        self._told |= now
+        return since
 
     def emit(self, now_s: float) -> bytes:
         """See `ByteDevice`."""

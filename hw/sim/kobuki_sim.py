@@ -10,7 +10,8 @@ from hw.framing import ByteWindow, Counters
 from hw.sim.bases_sim import Counting, Streaming
 
 HARDWARE, FIRMWARE, UNIQUE_ID = (1, 0, 4), (1, 2, 0), (0x30414B55, 0x4B4F4255, 0x00000001)
-GAINS = (0, 100_000, 100, 2_000)  # the factory's own (0), P, I and D in thousandths
+FACTORY_GAINS = (0, 100_000, 100, 2_000)  # the factory's own (0), P, I and D in thousandths
+SET_GAINS, GET_GAINS = 13, 14  # of the wheels' controller
 IDLE_PARTS = (  # sub-payloads of a robot that is far from its dock, with nothing plugged in
     struct.pack("<BB3B", 3, 3, 0, 0, 0),  # docking infra-red
     struct.pack("<BB3H", 5, 6, 1500, 1500, 1500),  # cliff sensors see the floor
@@ -30,6 +31,7 @@ class KobukiSim(Streaming):
         self._counters = Counters()
         self._window = ByteWindow(self._counters, 1024)
         self._commands = kobuki.frames()
+        self._gains = struct.pack("<B3I", *FACTORY_GAINS)
         self._extra = b""  # sub-payloads that were asked for
         self._sent = 0
         self._last: tuple[float, float] | None = None  # moment and heading of the frame before
@@ -50,8 +52,10 @@ class KobukiSim(Streaming):
             self._extra += struct.pack("<BB4B", 10, 4, *reversed(HARDWARE), 0) if flags & 1 else b""
             self._extra += struct.pack("<BB4B", 11, 4, *reversed(FIRMWARE), 0) if flags & 2 else b""
             self._extra += struct.pack("<BB3I", 19, 12, *UNIQUE_ID) if flags & 8 else b""
-        elif code == 14:  # get the gains of the wheels' controller
-            self._extra += struct.pack("<BBB3I", 21, 13, *GAINS)
+        elif code == SET_GAINS and len(body) == len(self._gains):
+            self._gains = body
+        elif code == GET_GAINS:
+            self._extra += bytes((21, len(self._gains))) + self._gains
 
     def emit(self, now_s: float) -> bytes:
         """See `ByteDevice`."""

@@ -16,7 +16,8 @@ from hw.sim.create2_sim import Create2Sim
 from hw.sim.devices import ByteDevice
 from hw.sim.kobuki_sim import KobukiSim
 from hw.sim.obedient import ObedientRobot
-from hw.sim.roboclaw_sim import FACTS, WRITES, ZEROS, RoboClawSim
+from hw.sim.roboclaw_sim import RoboClawSim
+from hw.sim.roboclaw_tables import FACTS, WRITES, ZEROS
 from tests.harness.serial_device import POSE, ROOM
 
 
@@ -75,6 +76,26 @@ def test_a_create2_reboots(robot: Create2Sim) -> None:
     assert answer(robot, bytes((142, 35))) == b"", "it is off again"
 
 
+def test_a_create2_tells_its_way_and_its_turn_since_they_were_last_told() -> None:
+    robot = ObedientRobot(ROOM, POSE, BASES["create2"].drive)
+    base = Create2Sim(Counting(robot))
+    base.receive(bytes((128, 131, 145)) + struct.pack(">hh", 250, 150), 5.0)
+    told = []
+    for k in range(1, 5):
+        base.receive(bytes((149, 6, 19, 20, 41, 42, 39, 40)), 5.0 + k / 2)
+        told.append(struct.unpack(">6h", base.emit(5.0 + k / 2 + 0.01)))
+    way_mm, turn_deg = (sum(values) for values in list(zip(*told, strict=True))[:2])
+    assert (way_mm, turn_deg) == pytest.approx((400, math.degrees(2 * 100 / 235)), abs=1)
+    assert told[0][2:] == (250, 150, 0, 0)
+
+
+def test_a_create2_changes_its_rate_until_it_is_reset(robot: Create2Sim) -> None:
+    robot.receive(bytes((129, 7)), 5.0)
+    assert robot.baud == 19200
+    robot.receive(bytes((7,)), 5.1)
+    assert robot.baud == 115200
+
+
 def test_a_roboclaw_takes_a_command_in_pieces_and_answers_by_any_address() -> None:
     board = RoboClawSim(Counting(Turned()))
     command = roboclaw.write_command(0x83, 37, struct.pack(">ii", 1000, -1000))
@@ -92,7 +113,7 @@ def test_a_roboclaw_drops_half_a_command_and_one_with_a_wrong_sum() -> None:
     assert answer(board, roboclaw.write_command(0x80, 6, b"\x10")[:-1] + b"\0") == b""
 
 
-@pytest.mark.parametrize("code", [*FACTS, *ZEROS, 16, 17, 18, 19, 30, 31, 73, 78, 79, 108])
+@pytest.mark.parametrize("code", [*FACTS, *ZEROS, 16, 17, 18, 19, 30, 31, 47, 73, 78, 79, 108])
 def test_a_roboclaw_answers_every_read_with_its_checksum(code: int) -> None:
     said = answer(RoboClawSim(Counting(Turned())), bytes((0x81, code)))
     assert roboclaw.opened(0x81, code, said), "data, and a checksum that covers the question"
@@ -105,8 +126,31 @@ def test_a_roboclaw_sets_its_counters() -> None:
     assert roboclaw.decode_counts(0x80, answer(board, bytes((0x80, roboclaw.READ_ENCODERS)))) == (-100, -7)
 
 
+def test_a_roboclaw_goes_ways_one_behind_the_other_and_says_when_it_is_there() -> None:
+    robot = ObedientRobot(ROOM, POSE, BASES["roboclaw"].drive)
+    board, ask = RoboClawSim(Counting(robot)), bytes((0x80, 47))
+    board.receive(roboclaw.write_command(0x80, 43, struct.pack(">iIiIB", 1000, 500, -1000, 1000, 1)), 1.0)
+    board.receive(roboclaw.write_command(0x80, 41, struct.pack(">iIB", 2000, 500, 0)), 1.0)
+    assert board.emit(1.0) == b"\xff\xff"
+    for when_s, ticks, buffers in ((1.4, (400, -400), b"\1\0"), (1.7, (900, -700), b"\0\0"), (2.5, (1000, -1000), b"\x80\x80")):
+        board.receive(ask, when_s)
+        assert roboclaw.opened(0x80, 47, board.emit(when_s)) == buffers
+        assert robot.ticks_at(when_s) == pytest.approx(ticks, abs=1)
+    board.receive(roboclaw.write_command(0x80, 66, struct.pack(">IIIiB", 0, 2000, 0, 0, 1)), 3.0)
+    board.emit(4.0)
+    assert robot.ticks_at(4.0) == pytest.approx((1000, 0), abs=1), "back to where its counter was 0"
+
+
+def test_a_roboclaw_mixes_ahead_and_aside() -> None:
+    robot = ObedientRobot(ROOM, POSE, BASES["roboclaw"].drive)
+    board = RoboClawSim(Counting(robot))
+    board.receive(roboclaw.write_command(0x80, 8, b"\x40") + roboclaw.write_command(0x80, 11, b"\x20"), 1.0)
+    left, right = robot.ticks_at(2.0)
+    assert (left, right) == pytest.approx((5000 * 32 / 127, 5000 * 96 / 127), abs=1)
+
+
 @pytest.mark.parametrize(("line", "said"), [
-    (b"b", b" 57600\r\n"), (b"e", b"-100 70000\r\n"), (b"r", b"OK\r\n"), (b"m 10 10", b"OK\r\n"), (b"u 20:12:0:50", b"OK\r\n"),
+    (b"b", b"57600\r\n"), (b"e", b"-100 70000\r\n"), (b"r", b"OK\r\n"), (b"m 10 10", b"OK\r\n"), (b"u 20:12:0:50", b"OK\r\n"),
     (b"a 3", b"512\r\n"), (b"d 2", b"0\r\n"), (b"p 5", b"100\r\n"), (b"t 0", b"90\r\n"), (b"c 13 1", b"OK\r\n"),
     (b"w 13 1", b"OK\r\n"), (b"x 9 128", b"OK\r\n"), (b"s 0 90", b"OK\r\n"), (b"o 100 -100", b"OK\r\n"),
     (b"", b"Invalid Command\r\n"), (b"q", b"Invalid Command\r\n"),
@@ -138,6 +182,10 @@ def test_a_kobuki_tells_once_what_it_is_asked() -> None:
     told, after = kobuki.decode(base.emit(1.02)), kobuki.decode(base.emit(1.04))
     assert told is not None and after is not None
     assert {code: len(told[code]) for code in told.keys() - after.keys()} == {10: 4, 11: 4, 19: 12, 21: 13}
+    gains = struct.pack("<B3I", 1, 7, 8, 9)
+    base.receive(kobuki.encode(b"\x0d\x0d" + gains) + kobuki.encode(b"\x0e\x01\x00"), 1.05)
+    told = kobuki.decode(base.emit(1.06))
+    assert told is not None and told[21] == gains
 
 
 COMMANDS: dict[str, tuple[bytes, float, float]] = {  # commands, and the speeds of left and right wheel they mean, m/s
