@@ -14,10 +14,10 @@ from typing import Protocol
 from hw.carmen import read_recording
 from hw.sim.catalogue import BASES, LIDARS
 from hw.sim.devices import ByteDevice, SickScanner
+from hw.sim.pty_port import TICK_S, PtyServer
 from hw.sim.replay import Replay, ReplayBoard, ReplayScans
 from hw.sim.robot import SimulatedRobot
 from hw.sim.sight import Sight
-from hw.sim.sim_port import TICK_S, PtyServer
 from hw.sim.world import World, open_world
 from protocol.geometry import SE2
 from protocol.grid import OccupancyGrid

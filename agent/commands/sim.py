@@ -18,9 +18,9 @@ from hw.sim.catalogue import BASES, LIDARS, NAMES, USUAL, device_url
 from hw.sim.devices import ByteDevice
 from hw.sim.faults import KINDS, RATES, FaultyDevice, Schedule
 from hw.sim.obedient import ObedientRobot
+from hw.sim.pty_port import PtyServer
 from hw.sim.robot import DriveOptions, SimulatedRobot
 from hw.sim.sight import PoseSource, Sight
-from hw.sim.sim_port import PtyServer
 from hw.sim.world import World, open_world
 from protocol.geometry import SE2
 

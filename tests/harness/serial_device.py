@@ -24,9 +24,9 @@ from hw.readings import LaserScan
 from hw.sim.catalogue import BASES, LIDARS, device_url
 from hw.sim.faults import FaultyDevice, Schedule
 from hw.sim.obedient import ObedientRobot
+from hw.sim.pty_port import PtyServer
 from hw.sim.raycast import cast_all
 from hw.sim.sight import Sight
-from hw.sim.sim_port import PtyServer
 from hw.sim.world import World
 from protocol.geometry import SE2
 

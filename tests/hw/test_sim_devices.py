@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import select
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -13,10 +14,10 @@ from hw.device import open_lidar, open_wheels
 from hw.readings import LaserScan, Odometry
 from hw.sim.catalogue import BASES, LIDARS, device_url
 from hw.sim.obedient import ObedientRobot
+from hw.sim.pty_port import PtyLine, PtyServer
 from hw.sim.raycast import cast_all
 from hw.sim.robot import SimulatedRobot
 from hw.sim.sight import Sight
-from hw.sim.sim_port import PtyServer
 from hw.sim.world import World
 from protocol.geometry import SE2
 from tests.harness.waiting import first_reading
@@ -53,7 +54,7 @@ def test_a_driver_measures_the_room_a_simulated_lidar_stands_in(name: str, serve
     make, _ = LIDARS[name]
     path = serve(make(Sight(ObedientRobot(ROOM, POSE), noise_m=0.0)))
     with open_lidar(device_url(name, path)) as device:
-        scan = first_reading(device, lambda reading: isinstance(reading, LaserScan) and not reading.is_partial, 8.0)
+        scan = first_reading(device, lambda reading: isinstance(reading, LaserScan) and not reading.is_partial, 15.0)
     assert isinstance(scan, LaserScan)
     errors = errors_m(scan)
     assert len(errors) > 0.9 * len(scan.ranges_m)
@@ -105,3 +106,32 @@ def test_a_robot_that_explores_is_measured_as_it_drives(serve: Serve) -> None:
         scan = first_reading(device, lambda reading: isinstance(reading, LaserScan) and not reading.is_partial, 5.0)
     assert isinstance(scan, LaserScan)
     assert np.isfinite(scan.ranges_m).mean() > 0.95
+
+
+def test_a_unit_on_usb_waits_for_a_slow_host_and_a_serial_line_does_not(tmp_path: Path) -> None:
+    class Talker:
+        """Says so much at once."""
+
+        def __init__(self, baud: int) -> None:
+            self.baud, self._said = baud, [bytes(range(256)) * 120]
+
+        def receive(self, data: bytes, now_s: float) -> None:
+            """Is deaf."""
+
+        def emit(self, now_s: float) -> bytes:
+            return self._said.pop() if self._said else b""
+
+    def heard(baud: int) -> bytes:
+        line = PtyLine(Talker(baud), tmp_path / "port")
+        with Path(tmp_path / "port").open("rb", buffering=0) as host:
+            data = b""
+            while True:
+                line.pump(0.0)
+                if not select.select([host], [], [], 0)[0]:
+                    break
+                data += host.read(4096)
+        line.close()
+        return data
+
+    assert heard(0) == bytes(range(256)) * 120
+    assert 4096 <= len(heard(38400)) < 256 * 120
