@@ -104,7 +104,7 @@ class ArduinoBridge(Quiet):
         self._pending[:] = tail[-MAX_LINE_BYTES:]
         samples = []
         for line in lines:
-            counts = decode_counts(line.strip(b"\r"))
+            counts = decode_counts(line.strip())
             if counts is None:
                 self.counters.skip(len(line) + 1)
                 continue

@@ -189,7 +189,8 @@ class Hokuyo(DriverBase):
         step_s = 60.0 / p.rpm / p.steps_per_turn
         sent_at_s = self._clock.to_host(scan.clock_ms / 1e3, arrived_s)  # the clock is read as the beam passes step 0
         first_s = sent_at_s - step_s * (p.last_step - scan.first_step)
-        metres = np.where(scan.values < p.range_min_mm, np.nan, scan.values / 1e3)
+        is_told = (scan.values >= p.range_min_mm) & (scan.values < scan.most_mm)
+        metres = np.where(is_told, scan.values / 1e3, np.nan)
         with np.errstate(invalid="ignore"):
             metres = np.where((metres < self.range_min_m) | (metres > self.range_max_m), np.nan, metres)
         if self._sees_nothing_as_free:

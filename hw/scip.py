@@ -159,6 +159,7 @@ class ScanData:
     clock_ms: int
     values: NDArray[np.int64]
     intensities: NDArray[np.int64] | None = None
+    most_mm: int = 2**18 - 1  # the highest that its characters can say stands for everything farther
 
 
 def scan_of(message: Message) -> ScanData | None:
@@ -180,7 +181,7 @@ def scan_of(message: Message) -> ScanData | None:
     clock_ms = decode_value(message.lines[0])
     if words == 2:
         return ScanData(first, cluster, clock_ms, values[0::2], values[1::2])
-    return ScanData(first, cluster, clock_ms, values)
+    return ScanData(first, cluster, clock_ms, values, most_mm=2 ** (6 * characters) - 1)
 
 
 def scan_command(mode: str, first_step: int, last_step: int, skip: int = 0) -> bytes:

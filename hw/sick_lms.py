@@ -96,8 +96,8 @@ class ScanPayload:
             return None
         info = payload[1] | payload[2] << 8
         n = info & 0x3FF
-        if n not in FIELDS or len(payload) != 4 + 2 * n or info >> 14 > 1:
-            return None
+        if n not in FIELDS or len(payload) not in (4 + 2 * n, 5 + 2 * n) or info >> 14 > 1:
+            return None  # one byte more: some number their scans
         return ScanPayload(struct.unpack_from(f"<{n}H", payload, 3), info >> 14 == 1, payload[-1])
 
 

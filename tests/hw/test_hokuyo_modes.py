@@ -9,6 +9,7 @@ import pytest
 
 from hw import scip
 from hw.device import open_lidar
+from hw.hokuyo import Hokuyo
 from hw.readings import LaserScan
 from hw.sim.hokuyo_sim import HokuyoSim
 from hw.sim.obedient import ObedientRobot
@@ -31,6 +32,13 @@ def test_a_hokuyo_measures_the_room_in_every_mode(mode: str, tmp_path: Path) -> 
     assert len(scan.ranges_m) == 682
     assert np.median(wall_errors_m(scan)) < 0.004
     assert (scan.intensities is not None) == mode.endswith("E")
+
+
+def test_what_two_characters_cannot_say_is_no_wall_at_4095_mm() -> None:
+    said = scip.encode_scan(b"MS0044072501000", 0, [4095] * 341 + [4094] * 341)
+    (scan,) = Hokuyo("MS").feed(said, 1.0)
+    assert isinstance(scan, LaserScan)
+    assert np.isnan(scan.ranges_m[:341]).all() and scan.ranges_m[341:] == pytest.approx(4.094)
 
 
 def test_a_hokuyo_on_a_slow_line_is_told_to_speak_faster_and_leaves_scans_out(tmp_path: Path) -> None:

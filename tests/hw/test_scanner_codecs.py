@@ -137,6 +137,12 @@ def test_what_is_nothing_in_millimetres_depends_on_the_measuring_mode(mode: int 
     assert np.allclose(metres[:6], seen, equal_nan=True)
 
 
+def test_a_sick_that_numbers_its_scans_is_understood() -> None:
+    numbered = sick_lms.ScanPayload((800,) * 361).encode()[:-1] + b"\x07\x10"
+    (scan,) = SickLms().feed(sick_lms.encode(numbered, sick_lms.SCANNER_ADDRESS), 1.0)
+    assert (scan.ranges_m == 8.0).all()
+
+
 def test_a_sick_in_a_hall_beyond_its_eight_metres_draws_no_wall_there() -> None:
     driver = SickLms()
     assert np.isnan(driver.feed(sick_lms.scan_telegram([0x1FFF] * 181, is_mm=True), 1.0)[0].ranges_m).all()
