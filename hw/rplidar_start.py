@@ -121,7 +121,8 @@ class RplidarStart(SpinningLidar):
         """The number of the express mode to ask for; None: the standard scan."""
         assert self.info is not None
         if self._mode.isdigit():
-            return int(self._mode)
+            kind = (yield from self._ask_conf(wire.CONF_ANSWER_TYPE, int(self._mode))) if self.info.has_conf else None
+            return None if _is_standard(kind) else int(self._mode)
         if self._mode == "standard":
             return None
         if self.info.has_conf:
@@ -141,6 +142,8 @@ class RplidarStart(SpinningLidar):
             kind = yield from self._ask_conf(wire.CONF_ANSWER_TYPE, mode)
             if kind is None or not kind.value:
                 continue
+            if self._mode == "auto" and _is_standard(kind):
+                return None
             if kind.value[0] == MODES.get(self._mode, kind.value[0]) and kind.value[0] in wire.SCAN_LENGTHS:
                 return mode
         if self._mode == "auto":
@@ -167,3 +170,8 @@ class RplidarStart(SpinningLidar):
             self._conf = wire.Conf.decode(body)
         elif kind == wire.BOARD_FLAG_TYPE and len(body) >= 4:
             self._board_flag = body[0] & 1
+
+
+def _is_standard(kind: wire.Conf | None) -> bool:
+    """Is this the standard scan?  It has a request of its own: asked for as an express mode, 0 is another one."""
+    return kind is not None and kind.value[:1] == bytes((wire.NODE_TYPE,))

@@ -217,7 +217,7 @@ class YdLidar(SpinningLidar):
 
     def _are_sane(self, first_deg: Floats, last_deg: Floats, step_deg: Floats, n: Ints) -> NDArray[np.bool_]:
         """Which packets can be true: angles on the circle, samples as dense as usual (one backwards spans the circle)."""
-        can_be = (first_deg < 360) & (last_deg < 360) & (step_deg < MOST_STEP_DEG)
+        can_be = (first_deg <= 360) & (last_deg <= 360) & (step_deg < MOST_STEP_DEG)
         usual_deg = self._usual_step_deg
         if self._is_strict:
             fits = np.abs(step_deg - usual_deg) * (n - 1) < 0.01 * usual_deg * n + 0.05

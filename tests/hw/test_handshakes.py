@@ -124,6 +124,13 @@ def test_the_typical_mode_is_taken_where_the_device_has_a_list(run, kind: int) -
     assert rplidar_wire.express_request(2) in port.heard
 
 
+def test_a_typical_mode_that_is_the_standard_scan_is_asked_for_by_its_own_request(run) -> None:
+    port = TalkingPort(FakeRplidar(express=STREAMS["rplidar-0x82"](seconds=1.0), typical=0x81))
+    driver = Rplidar()
+    _first_scan(run(driver, port))
+    assert driver.scan_type == rplidar_wire.NODE_TYPE
+
+
 def test_an_express_mode_that_is_refused_gives_way_to_the_standard_scan(run) -> None:
     old = rplidar_wire.Info(0x18, (1, 20), 0, bytes(16))
     driver = Rplidar()
