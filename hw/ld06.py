@@ -163,7 +163,9 @@ class Ld06(FixedFrameLidar):
         head = np.ascontiguousarray(frames[:, 2:6]).view("<u2").astype(np.float64)  # speed, start
         tail = np.ascontiguousarray(frames[:, 42:46]).view("<u2").astype(np.float64)  # end, ms
         span_cdeg = (tail[:, 0] - head[:, 1]) % 36000.0
-        is_sane = (head[:, 1] < 36000) & (tail[:, 0] < 36000) & (tail[:, 1] <= 30000) & self._turns_evenly(head[:, 0], span_cdeg)
+        is_sane = (
+            (head[:, 1] <= 36000) & (tail[:, 0] <= 36000) & (tail[:, 1] <= 30000) & self._turns_evenly(head[:, 0], span_cdeg)
+        )
         self.counters.rejected += int(np.count_nonzero(~is_sane))
         dirty = (gaps > 0) | ~is_sane
         frames, arrivals_s = frames[is_sane], arrivals_s[is_sane]

@@ -56,3 +56,17 @@ def test_a_ydlidar_whose_last_sample_lies_at_360_degrees_loses_no_packet(
     assert len(scans) >= 2 and driver.counters.rejected == 0
     assert scans[-1].ranges_m == pytest.approx(2.0)
     assert len(scans[-1].ranges_m) == pytest.approx(beams, abs=2)
+
+
+def test_an_ldrobot_packet_may_end_at_360_degrees() -> None:
+    frames = []
+    for k in range(150):  # 12 beams a degree apart, 30 packets a turn
+        first_deg = 12 * (k % 30) + 1
+        packet = ld06.Packet(
+            4500, 100 * first_deg, 100 * first_deg + 1100, round(8 * (k + 1) / 3) % 30000, (2000,) * 12, (200,) * 12
+        )
+        frames.append((10.0 + 12 * (k + 1) / 4500, ld06.encode(packet)))
+    driver = Ld06("ld06")
+    scans = whole_scans(driver, frames)
+    assert len(scans) >= 3 and driver.counters.rejected == 0
+    assert {len(scan.ranges_m) for scan in scans} == {360}
