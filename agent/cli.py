@@ -12,6 +12,7 @@ import difflib
 import importlib
 import json
 import os
+import re
 import signal
 import sys
 import threading
@@ -61,6 +62,9 @@ EXAMPLES = """\
   mapquilt merge a.yaml b.yaml -o both                             two nav2 maps into one
   mapquilt map recording.clf -o out                                a CARMEN log into a map
 """
+NEGATIVE_NUMBERS = re.compile(
+    r"-\.?\d[\d.,eE+-]*$"
+)  # of one number argparse knows it; here lists of them begin with a minus, too
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -155,7 +159,11 @@ def _without_command(argv: list[str]) -> int:
 
 
 class _Parser(argparse.ArgumentParser):
-    """One that answers a mistake with one sentence, as everything else here does."""
+    """One that answers a mistake with one sentence, as everything else here does, and takes `--pose -1,2,90` for a value."""
+
+    def __init__(self, *args: Any, **more: Any) -> None:
+        super().__init__(*args, **more)
+        self._negative_number_matcher = NEGATIVE_NUMBERS
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
         parsed, unknown = self.parse_known_args(args, namespace)

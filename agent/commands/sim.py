@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import shlex
 import signal
 import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
+from agent.arguments import number, whole
 from agent.exits import OK, USAGE, CommandError
 from hw.errors import DeviceConfigError
 from hw.sim.bases_sim import Counter
@@ -21,7 +23,7 @@ from hw.sim.obedient import ObedientRobot
 from hw.sim.pty_port import PtyServer
 from hw.sim.robot import DriveOptions, SimulatedRobot
 from hw.sim.sight import PoseSource, Sight
-from hw.sim.world import World, open_world
+from hw.sim.world import MAX_EXTENT_M, World, open_world
 from protocol.geometry import SE2
 
 EXAMPLES = """\
@@ -51,13 +53,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--pose", metavar="X,Y,DEG", help="where the robot stands, or starts (default: a free place in the world)"
     )
     parser.add_argument(
-        "--noise", metavar="METRES", type=float, default=0.01, help="one sigma of a range; 0: exact (default 0.01)"
+        "--noise", metavar="METRES", type=number(0, 10), default=0.01, help="one sigma of a range; 0: exact (default 0.01)"
     )
     parser.add_argument(
         "--explore", action="store_true", help="the robot drives around by itself, not into walls (else: as its base is told)"
     )
     parser.add_argument(
-        "--speed", metavar="M/S", type=float, default=USUAL.speed_mps, help="of the exploring robot (default %(default)s)"
+        "--speed",
+        metavar="M/S",
+        type=number(0.01, 2),
+        default=USUAL.speed_mps,
+        help="of the exploring robot (default %(default)s)",
     )
     parser.add_argument(
         "--fault",
@@ -65,8 +71,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="",
         help=f"KIND@SECONDS[:VALUE] or RATE=..., with commas; kinds: {', '.join(KINDS)}; rates: {', '.join(RATES)}",
     )
-    parser.add_argument("--seed", type=int, default=0, help="of noise, faults and the way the robot takes")
-    parser.add_argument("--seconds", type=float, default=math.inf, help="end after so long (default: when stopped)")
+    parser.add_argument("--seed", type=whole(0), default=0, help="of noise, faults and the way the robot takes")
+    parser.add_argument("--seconds", type=number(0), help="end after so long (default: when stopped)")
     parser.add_argument(
         "--mirrored", action="store_true", help="turn the scan the wrong way round: to see that a check of it can fail"
     )
@@ -80,17 +86,19 @@ def run(args: argparse.Namespace) -> int:
     except DeviceConfigError as error:
         raise CommandError(str(error), USAGE) from error
     stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    for ending in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(ending, lambda *_: stop.set())
     try:
         with PtyServer(lines):
             if not args.quiet:
                 for name, _, path in served:
-                    print(f"{path} -> {os.path.realpath(path)}  {name}; use it as {device_url(name, path)}", flush=True)
-            stop.wait(None if math.isinf(args.seconds) else args.seconds)
+                    print(
+                        f"{path} -> {os.path.realpath(path)}  {name}; use it as {shlex.quote(device_url(name, path))}", flush=True
+                    )
+            stop.wait(args.seconds)
     except OSError as error:
         raise CommandError(
-            f"{args.link}: {error.strerror or error}; the folder must exist, the name must be free", USAGE
+            f"{error.filename or args.link}: {error.strerror or error}; the folder must exist, the name must be free", USAGE
         ) from error
     return OK
 
@@ -101,10 +109,10 @@ def _devices(args: argparse.Namespace) -> list[tuple[str, ByteDevice, Path]]:
     for name, _ in asked:
         if name not in NAMES:
             raise DeviceConfigError(f"{name}: no such device; there are {', '.join(NAMES)}")
-    if args.noise < 0 or not 0 < args.speed <= 2:
-        raise DeviceConfigError(
-            f"--noise {args.noise:g} must not be negative, --speed {args.speed:g} must be above 0 and at most 2"
-        )
+    links = [path.absolute() for _, path in asked]
+    for path in links:
+        if links.count(path) > 1:
+            raise DeviceConfigError(f"{path}: two devices cannot share a port; give each a PATH of its own")
     world = open_world(args.world)
     pose = _pose(args.pose) if args.pose else world.start_poses(1, args.seed)[0]
     base = _base(args, world, pose, next((BASES[name].drive for name, _ in asked if name in BASES), USUAL))
@@ -122,7 +130,11 @@ def _pose(text: str) -> SE2:
     try:
         x_m, y_m, heading_deg = (float(word) for word in text.split(","))
     except ValueError:
-        raise DeviceConfigError(f"--pose {text}: write it as x,y,degrees, for example 2,1.5,90") from None
+        x_m = y_m = heading_deg = math.nan
+    if not (abs(x_m) <= MAX_EXTENT_M and abs(y_m) <= MAX_EXTENT_M and math.isfinite(heading_deg)):
+        raise DeviceConfigError(
+            f"--pose {text}: write it as x,y,degrees, for example 2,1.5,90; x and y at most {MAX_EXTENT_M:g} m from 0,0"
+        )
     return SE2(x_m, y_m, math.radians(heading_deg))
 
 

@@ -39,6 +39,8 @@ KINDS: dict[str, tuple[float, str]] = {  # kind: (usual value, what it does)
 RATES = {"drop-share": "share of bytes lost", "flip-share": "share of bytes with a turned bit", "storm": "random faults a second"}
 STORM = ("drop", "flip", "dup", "insert", "badsum", "half", "stall", "noise", "banner", "shift")
 BANNER = b"\r\nboot: brown-out, restarting\r\n"
+SIGNED = ("shift", "clock", "encoder-jump")  # these may go backwards
+MOST = 1e9  # seconds, bytes or ticks
 _BYTES = ("drop", "flip", "dup", "insert", "badsum", "banner", "half")
 _SPANS = ("stall", "noise", "wrong-baud", "unplug", "half")
 
@@ -70,24 +72,27 @@ class Schedule:
                 name, _, number = entry.partition("=")
                 if name not in RATES:
                     raise DeviceConfigError(f"fault '{entry}': no such rate; there are {', '.join(RATES)}")
-                rates[name] = _number(number, entry)
+                rates[name] = _number(number, entry, 0, 1000 if name == "storm" else 1)
                 continue
             kind, at, rest = entry.partition("@")
             if not at or kind not in KINDS:
                 raise DeviceConfigError(f"fault '{entry}': write KIND@SECONDS[:VALUE]; kinds are {', '.join(KINDS)}")
             seconds, _, value = rest.partition(":")
-            faults.append(Fault(kind, _number(seconds, entry), _number(value, entry) if value else KINDS[kind][0]))
+            least = -MOST if kind in SIGNED else 0
+            faults.append(
+                Fault(kind, _number(seconds, entry, 0, MOST), _number(value, entry, least, MOST) if value else KINDS[kind][0])
+            )
         ordered = tuple(sorted(faults, key=lambda fault: fault.at_s))
         return Schedule(ordered, rates["drop-share"], rates["flip-share"], rates["storm"])
 
 
-def _number(text: str, entry: str) -> float:
+def _number(text: str, entry: str, least: float, most: float) -> float:
     try:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not abs(value) < 1e9:
-        raise DeviceConfigError(f"fault '{entry}': '{text}' is no number")
+    if not least <= value <= most:
+        raise DeviceConfigError(f"fault '{entry}': '{text}' is no number from {least:g} to {most:g}")
     return value
 
 

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hw.errors import DeviceConfigError
 from protocol.geometry import SE2
 
 if TYPE_CHECKING:
@@ -155,7 +156,10 @@ def spread_starts(world: World, n: int, seed: int, spacing_m: float) -> list[SE2
     ways = Ways(clearance, START_CLEARANCE_M)
     rows, cols = np.nonzero(clearance.main_place(START_CLEARANCE_M))
     if not len(rows):
-        rows, cols = np.nonzero(clearance.metres == clearance.metres.max())
+        raise DeviceConfigError(
+            f"{world.name}: no place to start, {START_CLEARANCE_M:g} m off every wall; are the walls closed? "
+            "else say where: --pose x,y,degrees, or a line 'start x y degrees'"
+        )
     x0, y0, x1, y1 = world.bounds
     middle = clearance.cell((x0 + x1) / 2 + rng.normal(0, 2), (y0 + y1) / 2 + rng.normal(0, 1))
     first = int(np.argmin((rows - middle[0]) ** 2 + (cols - middle[1]) ** 2))

@@ -21,6 +21,7 @@ from hw.sim.faults import FaultyDevice, garbled
 TICK_S = 0.01  # how often bytes move; a 230400 baud line carries 230 bytes in that time
 TCGETS2 = 0x802C542A
 TERMIOS2 = struct.Struct("=4IB19sII")  # flags, line discipline, control characters, input and output rate
+PTYS = "/dev/pts/"  # a link to one of them is left over from a simulator that was killed
 USB_KEEPS_BYTES = 32768  # a unit on USB waits for a host that reads slowly, and leaves whole messages out beyond this
 
 
@@ -33,7 +34,7 @@ class PtyLine:
 
     def __init__(self, device: ByteDevice, link: Path) -> None:
         self.device, self.link = device, link
-        self._master = -1
+        self._master, self._name = -1, ""
         self._is_open = False  # by a client, at the last look
         self._kept = b""  # of a unit on USB, until its host reads
         self._poll = select.poll()
@@ -46,14 +47,14 @@ class PtyLine:
 
     def plug(self) -> None:
         """The port appears, under whatever name the system gives it."""
-        if self.link.exists() and not self.link.is_symlink():
+        if os.path.lexists(self.link) and not _target(self.link).startswith(PTYS):
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(self.link))
         self._master, slave = pty.openpty()
+        self._name = os.ttyname(slave)
         tty.setraw(slave)  # a fresh pty echoes: device bytes would come back as commands
         os.set_blocking(self._master, False)
-        aside = self.link.with_name(self.link.name + ".new")
-        aside.unlink(missing_ok=True)
-        aside.symlink_to(os.ttyname(slave))
+        aside = self.link.with_name(f".{self.link.name}.{os.getpid()}")
+        aside.symlink_to(self._name)
         aside.replace(self.link)
         os.close(slave)
         self._poll.register(self._master, select.POLLIN)
@@ -61,7 +62,8 @@ class PtyLine:
     def unplug(self) -> None:
         """The port is gone; whoever has it open reads an error."""
         if self._master >= 0:
-            self.link.unlink(missing_ok=True)
+            if _target(self.link) == self._name:  # else another simulator has taken the name over
+                self.link.unlink(missing_ok=True)
             self._poll.unregister(self._master)
             os.close(self._master)
             self._master, self._kept = -1, b""
@@ -100,6 +102,14 @@ class PtyLine:
     def close(self) -> None:
         """Unplug for good."""
         self.unplug()
+
+
+def _target(link: Path) -> str:
+    """Where a symbolic link points; of anything else nothing."""
+    try:
+        return os.readlink(link)
+    except OSError:
+        return ""
 
 
 def client_baud(master: int) -> int:

@@ -10,11 +10,11 @@ A world file lists one thing a line; `#` starts a comment:
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from urllib.parse import parse_qs, urlsplit
 
 import cv2
 import numpy as np
@@ -27,6 +27,7 @@ from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 ROBOT_RADIUS_M = 0.2
 MAX_SEGMENTS = 20_000
 MAX_EXTENT_M = 500.0
+MAX_FILE_BYTES = 4 << 20  # 20,000 walls take 1.2 MB when each number has 12 digits
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +61,8 @@ class World:
             if kind == "wall":
                 shapes.append(np.array([values]))
             elif kind == "circle":
+                if values[2] <= 0:
+                    raise DeviceConfigError(f"{name}:{number}: a circle of radius {values[2]:g}; give one above 0")
                 shapes.append(polygon(circle_points(values[0], values[1], values[2])))
             else:
                 starts.append(SE2(values[0], values[1], math.radians(values[2])))
@@ -96,18 +99,33 @@ def open_world(spec: str) -> World:
     """`office`, `office?seed=3`, `outdoor`, `random?seed=7`, or the path of a world file."""
     from hw.sim import worlds  # noqa: PLC0415  (worlds needs World)
 
-    parts = urlsplit(spec)
-    if parts.path in worlds.BUILT_IN:
-        query = parse_qs(parts.query)
-        seed_text = query.get("seed", ["0"])[0]
-        if not seed_text.isdigit():
-            raise DeviceConfigError(f"{spec}: seed is {seed_text!r}; give a whole number, as in {parts.path}?seed=3")
-        return worlds.BUILT_IN[parts.path](int(seed_text))
-    path = Path(parts.path)
-    if not path.is_file():
+    name, _, query = spec.partition("?")
+    if name in worlds.BUILT_IN:
+        return worlds.BUILT_IN[name](_seed(spec, name, query))
+    path = next((path for path in (spec, name) if os.path.isfile(path)), None)  # a file's name may hold a ? of its own
+    if path is None:
         names = ", ".join(sorted(worlds.BUILT_IN))
         raise DeviceConfigError(f"{spec}: neither a built-in world ({names}) nor a file")
-    return World.parse(path.read_text(errors="replace"), str(path))
+    return World.parse(_text(path), path)
+
+
+def _seed(spec: str, name: str, query: str) -> int:
+    """Of a built-in world."""
+    key, _, value = query.partition("=")
+    if query and not (key == "seed" and value.isascii() and value.isdecimal()):
+        raise DeviceConfigError(f"{spec}: '?{query}' is no seed; give a whole number, as in {name}?seed=3")
+    return int(value or 0)
+
+
+def _text(path: str) -> str:
+    try:
+        with Path(path).open("rb") as stream:
+            data = stream.read(MAX_FILE_BYTES + 1)
+    except OSError as error:
+        raise DeviceConfigError(f"{path}: cannot be read: {error.strerror}; is this the world's name?") from error
+    if len(data) > MAX_FILE_BYTES:
+        raise DeviceConfigError(f"{path}: over {MAX_FILE_BYTES} bytes; is this really a list of walls?")
+    return data.decode("utf-8-sig", "replace")
 
 
 def polygon(points: ArrayLike) -> NDArray[np.float64]:
@@ -133,7 +151,10 @@ def _numbers(words: list[str], count: int, where: str) -> list[float]:
     except ValueError:
         values = []
     if len(values) != count or not all(math.isfinite(v) and abs(v) <= MAX_EXTENT_M for v in values):
-        raise DeviceConfigError(f"{where}: {' '.join(words)[:60]!r}; expected {count} numbers of at most {MAX_EXTENT_M:.0f}")
+        raise DeviceConfigError(
+            f"{where}: {' '.join(words)[:60]!r}; expected {count} numbers of at most {MAX_EXTENT_M:.0f}: "
+            "a wall is 'x0 y0 x1 y1'; others are 'circle x y radius', 'start x y degrees'"
+        )
     return values
 
 

@@ -59,7 +59,22 @@ def test_a_fault_does_what_its_name_says(schedule: str, bytes_out: int) -> None:
     assert out != bytes(i % 256 for i in range(200))
 
 
-@pytest.mark.parametrize("text", ["stall", "stall@x", "stall@1:", "explode@1", "drop-share=a", "rain=1", "stall@1e12"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "stall",
+        "stall@x",
+        "stall@1:",
+        "explode@1",
+        "drop-share=a",
+        "rain=1",
+        "stall@1e12",
+        "drop@-1",
+        "stall@1:-1",
+        "drop-share=2",
+        "storm=-1",
+    ],
+)
 def test_a_schedule_that_cannot_be_is_refused_in_one_sentence(text: str) -> None:
     if text == "stall@1:":
         assert Schedule.parse(text).faults[0].value == 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from hw.sim.places import Clearance
 from hw.sim.raycast import cast, cast_all
 from hw.sim.robot import DriveOptions, SimulatedRobot
 from hw.sim.sight import Sight, Turntable
-from hw.sim.world import ROBOT_RADIUS_M, World, open_world
+from hw.sim.world import MAX_FILE_BYTES, ROBOT_RADIUS_M, World, open_world
 from protocol.geometry import SE2
 from protocol.grid import FREE, OCCUPIED
 
@@ -88,7 +89,7 @@ def test_a_world_file_says_walls_circles_and_starts() -> None:
 
 
 @pytest.mark.parametrize(("text", "says"), [("0 0 1", "room:1"), ("0 0 1 x", "room:1"), ("0 0 1 1e9", "room:1"), ("", "0 walls"),
-    ("0 0 1 1\ncircle 1 1", "room:2"), ("nan 0 1 1", "room:1")])  # fmt: skip
+    ("0 0 1 1\ncircle 1 1", "room:2"), ("circle 1 1 -1", "room:1"), ("nan 0 1 1", "room:1")])  # fmt: skip
 def test_a_bad_world_file_is_refused_with_its_line(text: str, says: str) -> None:
     with pytest.raises(DeviceConfigError, match=says):
         World.parse(text, "room")
@@ -97,8 +98,33 @@ def test_a_bad_world_file_is_refused_with_its_line(text: str, says: str) -> None
 def test_an_unknown_world_says_what_there_is() -> None:
     with pytest.raises(DeviceConfigError, match="office, outdoor, random"):
         open_world("ofice")
-    with pytest.raises(DeviceConfigError, match="seed"):
-        open_world("office?seed=x")
+    for spec in ("office?seed=x", "office?sed=3", "office?seed=-1", "office?seed=²"):
+        with pytest.raises(DeviceConfigError, match=r"office\?seed=3"):
+            open_world(spec)
+
+
+@pytest.mark.parametrize("name", ["what?.txt", "r#1.txt", "a b.txt", "r%20.txt", "http:x", "räum.txt", "room.txt?seed=3"])
+def test_a_world_file_may_have_any_name(name: str, tmp_path: Path) -> None:
+    (tmp_path / name.removesuffix("?seed=3")).write_bytes(b"\xef\xbb\xbf0 0 4 0\r\n4 0 4 4\r\n")  # as Windows' editor writes it
+    assert len(open_world(str(tmp_path / name)).segments) == 2
+
+
+def test_a_world_file_that_cannot_be_read_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "room.txt").write_bytes(b"#" * (MAX_FILE_BYTES + 1))
+    with pytest.raises(DeviceConfigError, match="list of walls"):
+        open_world(str(tmp_path / "room.txt"))
+
+    def denied(*_: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "open", denied)
+    with pytest.raises(DeviceConfigError, match="Permission denied"):
+        open_world(str(tmp_path / "room.txt"))
+
+
+def test_walls_that_leave_no_place_to_start_are_said() -> None:
+    with pytest.raises(DeviceConfigError, match="--pose"):
+        World.parse("0 0 4 0", "wall.txt").start_poses(1)
 
 
 def driven(world: World, seconds: float, seed: int = 0) -> np.ndarray:
