@@ -159,7 +159,8 @@ class RplidarSim:
         if not self._is_turning or self._mode is None or self._head is None or not (parts := self._head.due(now_s)):
             return b""
         index, times_s, cuts = joined(parts)
-        turn_deg = index * 360.0 / self._head.beams_per_turn
+        # No real turn begins at 0 to the digit, and the maker's SDK would not see it pass.
+        turn_deg = (index + 0.5) * 360.0 / self._head.beams_per_turn
         limits_m = (0.05, self.unit.range_max_m)
         if self._mode.type == wire.ULTRA_TYPE:
             mm = solve_angles(self._sight, times_s, turn_deg, lambda d: -ultra_offset_deg(d), limits_m)

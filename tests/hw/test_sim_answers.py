@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import struct
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from hw import rplidar_wire, scip, ydlidar_wire
+from hw.rplidar_capsules import KINDS, start_angles_q6
 from hw.sim.catalogue import HOKUYOS
 from hw.sim.hokuyo_sim import HokuyoSim
 from hw.sim.obedient import ObedientRobot
@@ -84,6 +86,25 @@ def test_an_rplidar_hears_what_comes_behind_garbage(garbage: bytes) -> None:
     lidar, question = RplidarSim("rplidar-a1", sight()), rplidar_wire.request(rplidar_wire.HEALTH_CMD)
     health = rplidar_wire.answer(rplidar_wire.HEALTH_TYPE, bytes(3))
     assert answer(lidar, garbage + question) == health
+
+
+@pytest.mark.parametrize(("model", "mode", "hz"), [
+    ("rplidar-a1", 1, 5), ("rplidar-a1", 2, 5), ("rplidar-a3", 3, 10), ("rplidar-a3", 4, 10), ("rplidar-s1", 1, 10),
+    ("rplidar-c1", 1, 10), ("rplidar-s2", 1, 10), ("rplidar-s2", 2, 10), ("rplidar-s3", 1, 10),
+])  # fmt: skip
+def test_the_makers_sdk_sees_every_turn_of_an_rplidar_pass(model: str, mode: int, hz: int) -> None:
+    """It counts in whole numbers: a turn begins where the angle of the next beam, rounded down, is past zero."""
+    lidar = RplidarSim(model, sight())
+    lidar.receive(rplidar_wire.express_request(mode), 5.0)
+    stream = b"".join(lidar.emit(5.0 + k / 50) for k in range(51))[7:]
+    kind = KINDS[lidar.unit.modes[mode].type]
+    capsules = np.frombuffer(stream[: len(stream) // kind.length * kind.length], np.uint8).reshape(-1, kind.length)
+    starts_q16 = (start_angles_q6(kind, capsules)[0].astype(int) & 0x7FFF) << 10
+    turns, circle_q16 = 0, 360 << 16
+    for start_q16, next_q16 in pairwise(starts_q16.tolist()):
+        step_q16 = (next_q16 - start_q16) % circle_q16 // kind.samples
+        turns += sum((start_q16 + (k + 1) * step_q16) % circle_q16 < step_q16 for k in range(kind.samples))
+    assert turns == pytest.approx(hz, abs=1)
 
 
 def test_an_rplidar_forgets_half_a_request_and_takes_one_in_two_halves() -> None:
