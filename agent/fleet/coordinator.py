@@ -213,6 +213,11 @@ class Coordinator:
         """The encoded answer to a query on our subtree, at most 16 KB; None: there is no such register."""
         return None if self.is_twin else self._registers.answer(key)
 
+    def peer_maps(self) -> dict[str, tuple[bytes, OccupancyGrid]]:
+        """(digest, cells) of the newest map that is here of each peer."""
+        peers = self._ledger.peers.values()
+        return {peer.robot: (peer.held.digest, peer.grid) for peer in peers if peer.held is not None and peer.grid is not None}
+
     def state(self, now_s: float) -> FleetState:
         """The fleet as we see it."""
         return self._overview.state(self._ledger.clock.at(now_s), self._words.T_map_robot, is_twin=self.is_twin)

@@ -17,7 +17,7 @@ from hw.readings import Odometry
 from protocol.geometry import SE2, wrap_angle
 
 EXTRAPOLATION_S = 0.25  # a scan may be this much younger than the youngest odometry sample; boards report at 10 to 50 Hz
-KEPT_SAMPLES = 4096  # about 80 s at 50 Hz: longer than any gap between two scans that is still worth bridging
+KEPT_SAMPLES = 2048  # 20 s at 100 Hz: longer than any gap between two scans that is still worth bridging
 LONGEST_GAP_S = 10.0  # without a sample: the board may have started anew meanwhile
 CLOCK_RESTART_S = 1.0  # a stamp this much older than the last is another clock; less is a late sample
 SLOWEST_SPEED_LIMIT_S = 0.1  # two samples closer in time than this are judged as if this far apart: stamps jitter

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from agent.fleet.coordinator import Coordinator, LocalMap
-from agent.fleet.effects import Changed, Effect, Fetch, Fuse, Match, MatchKind, Note, Send
+from agent.fleet.effects import Changed, Effect, Fetch, Fuse, Match, Note, Send
 from agent.fleet.state import FleetState
 from agent.runtime.exchange import Exchange
 from agent.runtime.guard import Guard, OpenGuard
@@ -33,7 +33,6 @@ log = logging.getLogger(__name__)
 
 TICK_S = 0.1
 WAIT_S, PULL_WAIT_S = 0.05, 0.25
-MAX_PEER_MAPS = 32
 
 
 class FleetWorker:
@@ -57,7 +56,6 @@ class FleetWorker:
         self.poses: Latest[SE2] = Latest()
         self.garbage = 0  # messages that no robot of ours sends
         self.global_map: GlobalMap | None = None
-        self.peer_maps: dict[str, tuple[bytes, OccupancyGrid]] = {}  # replaced, never changed, by this worker only
         self._coordinator, self._merger, self._on_note = coordinator, merger, on_note
         self._guard: Guard = guard or OpenGuard()
         self._turn = threading.Lock()
@@ -172,19 +170,11 @@ class FleetWorker:
             except queue.Full:
                 self._results.put((effect, None))
         elif isinstance(effect, Match | Fuse):
-            self._remember(effect)
             self._merger.submit(effect, self._results.put)
         elif isinstance(effect, Changed):
             self.global_map = effect.global_map
         else:
             self._note(effect)
-
-    def _remember(self, job: Match | Fuse) -> None:
-        """Keep the newest cells of every peer that was compared with us: the page shows them."""
-        if isinstance(job, Match) and job.kind is not MatchKind.COARSE:
-            self.peer_maps[job.peer] = (job.theirs_digest, job.theirs)
-            while len(self.peer_maps) > MAX_PEER_MAPS:
-                self.peer_maps.pop(next(iter(self.peer_maps)))
 
     def _publish(self, message: Message) -> None:
         channel = BY_KIND[type(message)]
@@ -216,6 +206,11 @@ class FleetWorker:
     def state(self) -> FleetState:
         with self._turn:
             return self._coordinator.state(self._pace.clock())
+
+    def peer_maps(self) -> dict[str, tuple[bytes, OccupancyGrid]]:
+        """(digest, cells) of the newest map that is here of each peer."""
+        with self._turn:
+            return self._coordinator.peer_maps()
 
     def order(self, verb: str, peer: str) -> None:
         """`unmerge` or `readmit` a peer, as the operator wishes."""

@@ -171,7 +171,8 @@ def global_facts(node: Node) -> dict[str, Any] | None:
 
 
 def maps(node: Node) -> dict[str, dict[str, Any]]:
-    found = {name: found for name in [GLOBAL, node.robot, *node.fleet.peer_maps] if (found := grid_of(node, name)) is not None}
+    peers = {name: (digest.hex(), grid) for name, (digest, grid) in node.fleet.peer_maps().items()}
+    ours = {name: found for name in (GLOBAL, node.robot) if (found := grid_of(node, name)) is not None}
     return {
         name: {
             "version": version,
@@ -180,19 +181,19 @@ def maps(node: Node) -> dict[str, dict[str, Any]]:
             "resolution_m": grid.resolution_m,
             "origin": [grid.origin.x_m, grid.origin.y_m, grid.origin.theta_rad],
         }
-        for name, (version, grid) in found.items()
+        for name, (version, grid) in {**peers, **ours}.items()
     }
 
 
 def grid_of(node: Node, name: str) -> tuple[str, OccupancyGrid] | None:
-    """(version, cells) of the global map, of our own, or of a peer's as last compared."""
+    """(version, cells) of the global map, of our own, or of a peer's as it is held here."""
     if name == GLOBAL:
         global_map = node.fleet.global_map
         return None if global_map is None else (global_map.digest.hex(), global_map.grid)
     if name == node.robot:
         estimate = node.map.newest
         return None if estimate is None else (f"{estimate.epoch}.{estimate.revision}", estimate.grid)
-    held = node.fleet.peer_maps.get(name)
+    held = node.fleet.peer_maps().get(name)
     return None if held is None else (held[0].hex(), held[1])
 
 
