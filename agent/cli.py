@@ -8,6 +8,7 @@ Who asked for `--json` gets JSON whatever happens: a failure is one object with 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import difflib
 import importlib
 import json
@@ -17,6 +18,7 @@ import signal
 import sys
 import threading
 import traceback
+from collections.abc import Iterator
 from signal import default_int_handler
 from types import ModuleType
 from typing import Any, NoReturn
@@ -71,7 +73,10 @@ def main(argv: list[str] | None = None) -> int:
     """Runs one command; never raises, the return value is the exit code."""
     argv = sys.argv[1:] if argv is None else argv
     try:
-        return _dispatch(argv)
+        with _ending_in_order():
+            return _dispatch(argv)
+    except _Ended as ended:
+        return 128 + ended.number
     except CommandError as error:
         return _failed(argv, str(error), error.code)
     except KeyboardInterrupt:
@@ -83,6 +88,34 @@ def main(argv: list[str] | None = None) -> int:
         traceback.print_exc()
         said = f"this is a bug of ours ({type(error).__name__}: {error}); please report it with the lines above"
         return _failed(argv, said, BUG)
+
+
+class _Ended(BaseException):
+    """A signal asked for the end: what is open is closed on the way out, a LIDAR's motor stopped, a recording finished."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+
+@contextlib.contextmanager
+def _ending_in_order() -> Iterator[None]:
+    """SIGTERM, and SIGHUP of a terminal that went away, unwind the command as Ctrl-C does; commands may have their own way."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    caught = [number for number in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(number) is signal.SIG_DFL]
+    for number in caught:
+        signal.signal(number, _end)
+    try:
+        yield
+    finally:
+        for number in caught:
+            if signal.getsignal(number) is _end:
+                signal.signal(number, signal.SIG_DFL)
+
+
+def _end(number: int, _: object) -> NoReturn:
+    raise _Ended(number)
 
 
 def _failed(argv: list[str], message: str, code: int) -> int:

@@ -7,6 +7,7 @@ P5 <width> <height> <maxval> <one whitespace> <pixels>      P2: the same, pixels
 from __future__ import annotations
 
 import re
+import stat
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +28,11 @@ class ImageFileError(Exception):
 def load_image(path: Path) -> Pixels:
     """(H, W) or (H, W, C) uint8 or uint16, first row on top, full scale; C as cv2 orders it (BGR, BGRA)."""
     try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise ImageFileError(f"{path}: {path.stat().st_size} bytes are more than any map image has")
+        found = path.stat()
+        if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):  # /dev/zero has no end
+            raise ImageFileError(f"{path}: no file but a device or a pipe; save the image to a file first")
+        if found.st_size > MAX_FILE_BYTES:
+            raise ImageFileError(f"{path}: {found.st_size} bytes are more than any map image has")
         data = path.read_bytes()
     except (OSError, ValueError) as error:
         raise ImageFileError(f"{path}: {getattr(error, 'strerror', None) or error}") from error

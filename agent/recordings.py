@@ -13,6 +13,7 @@ from pathlib import Path
 from hw.carmen import RecordedScan, read_recording
 from hw.errors import DeviceConfigError
 from hw.readings import LaserScan, Odometry
+from hw.recorder import MAGIC
 from protocol.geometry import SE2
 
 LONGEST_STEP_S = 1e-6  # stamps that repeat or go back follow the one before by this
@@ -46,6 +47,15 @@ def open_recording(path: Path, scan_topic: str | None = None, odometry_topic: st
         from agent.rosbags_reader import read_bag  # noqa: PLC0415  an optional package
 
         return in_order(read_bag(path, scan_topic, odometry_topic))
+    try:
+        with path.open("rb") as stream:
+            if stream.read(len(MAGIC)) == MAGIC:
+                raise RecordingError(
+                    f"{path}: the bytes of one device, as mapquilt record keeps them; be the robot that saw them: "
+                    "mapquilt run --lidar replay:FILE --wheels replay:FILE"
+                )
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror or error}") from error
     try:
         recording = read_recording(path)
     except DeviceConfigError as error:

@@ -150,6 +150,8 @@ def why_not_open(path: str, error: BaseException) -> str:
         return f"{path}: another program has it open ({user_of(path) or 'unknown'}); stop that program first"
     if number == errno.ENOENT or not os.path.exists(path):
         return f"{path}: no such port; is it plugged in? `mapquilt devices` lists the ports there are"
+    if number == errno.EISDIR or "(25," in str(error):  # pyserial's ENOTTY
+        return f"{path}: no serial port; `mapquilt devices` lists the ports there are"
     return f"{path}: cannot be opened: {error}"
 
 

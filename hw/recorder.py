@@ -8,13 +8,16 @@ are read, `loop=1` for ever), so what a robot saw in the field is seen again on 
 
 from __future__ import annotations
 
+import errno
+import os
+import stat
 import struct
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from io import FileIO
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO
 
 from hw.device import build_driver, register_scheme
 from hw.errors import DeviceAbsent, DeviceConfigError
@@ -28,22 +31,44 @@ _RECORD = struct.Struct("<QI")
 
 
 class Recorder:
-    """Writes a recording; call it with the time and the bytes of each read."""
+    """Writes a recording; call it with the time and the bytes of each read.
+
+    An older recording in the same file is replaced when the first bytes come, not before; a disk that is full ends the
+    recording, and `failed` says so.
+    """
 
     def __init__(self, path: Path, url: str) -> None:
         self.bytes_written = 0
+        self.failed = ""
+        self._head = MAGIC + url.encode() + b"\n"
         self._first_s: float | None = None
         try:
-            self._file: BinaryIO = path.open("wb")
+            self._file: FileIO = path.open("ab", buffering=0)
         except OSError as error:
             raise DeviceConfigError(f"{path}: cannot be written: {error.strerror}; choose another file") from error
-        self._file.write(MAGIC + url.encode() + b"\n")
 
     def __call__(self, now_s: float, data: bytes) -> None:
         """Keep one read."""
-        first_s = self._first_s = now_s if self._first_s is None else self._first_s
-        self._file.write(_RECORD.pack(max(0, round((now_s - first_s) * 1e9)), len(data)) + data)
-        self.bytes_written += len(data)
+        if self.failed:
+            return
+        try:
+            if self._first_s is None:
+                self._first_s = now_s
+                self._begin()
+            self._put(_RECORD.pack(max(0, round((now_s - self._first_s) * 1e9)), len(data)) + data)
+        except OSError as error:
+            self.failed = error.strerror or str(error)
+        else:
+            self.bytes_written += len(data)
+
+    def _begin(self) -> None:
+        if stat.S_ISREG(os.fstat(self._file.fileno()).st_mode):
+            self._file.truncate(0)
+        self._put(self._head)
+
+    def _put(self, data: bytes) -> None:
+        if self._file.write(data) != len(data):  # the last bytes that a disk had room for
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def close(self) -> None:
         """Finish the file."""

@@ -31,6 +31,8 @@ def run(args: argparse.Namespace) -> int:
     known = {port.device: port for port in serial_ports()}
     ports = [known.get(name, SerialPortInfo(name)) for name in args.port] or list(known.values())
     if not ports:
+        if args.json:
+            print("[]")
         print("no serial port; is the adapter plugged in? (`dmesg | tail` tells what the kernel saw)", file=sys.stderr)
         return NEGATIVE
     wanted = tuple(args.schemes.split(",")) if args.schemes else PROBE_URLS

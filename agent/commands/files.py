@@ -47,4 +47,4 @@ def written_file(path: Path, data: bytes) -> Path:
 
 
 def _cannot_write(path: Path, error: OSError) -> CommandError:
-    return CommandError(f"{path}: cannot be written ({error.strerror or error}); give another place with -o", ENVIRONMENT)
+    return CommandError(f"{path}: cannot be written ({error.strerror or error}); give another place", ENVIRONMENT)

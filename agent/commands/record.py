@@ -7,7 +7,8 @@ import sys
 import time
 from pathlib import Path
 
-from agent.exits import NEGATIVE, OK, USAGE, CommandError
+from agent.arguments import number
+from agent.exits import ENVIRONMENT, NEGATIVE, OK, USAGE, CommandError
 from hw.device import open_lidar, open_wheels, schemes
 from hw.errors import DeviceConfigError
 from hw.recorder import Recorder
@@ -20,27 +21,31 @@ EXAMPLES = """\
   mapquilt run --lidar replay:lidar.rec --wheels replay:wheels.rec
 """
 
+NO_BYTES = ("sim", "log", "replay")  # no serial device speaks there
 START_S = 20.0  # a device whose rate must be found, and whose motor must spin up, takes some of it
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("device", metavar="DEVICE", help="for example ld06:/dev/ttyUSB0")
     parser.add_argument("file", metavar="FILE", type=Path)
-    parser.add_argument("--seconds", type=float, default=0.0, help="stop so long after the first reading (0: Ctrl-C)")
+    parser.add_argument("--seconds", type=number(0), default=0.0, help="stop so long after the first reading (0: Ctrl-C)")
 
 
 def run(args: argparse.Namespace) -> int:
     try:
-        is_wheels = parse_url(args.device).scheme in schemes("wheels")
-        device = (open_wheels if is_wheels else open_lidar)(args.device)
-        if not isinstance(device, Device):
-            raise DeviceConfigError(f"{args.device} has no bytes of its own; record a device on a serial port")
+        scheme = parse_url(args.device).scheme
+        if scheme in NO_BYTES:
+            raise DeviceConfigError(f"{args.device}: nothing to record; give a device on a serial port, or one of `mapquilt sim`")
+        device = (open_wheels if scheme in schemes("wheels") else open_lidar)(args.device)
+        assert isinstance(device, Device), "what has a serial port is one"
         recorder = Recorder(args.file, args.device)
     except DeviceConfigError as error:
         raise CommandError(str(error), USAGE) from error
     with recorder:
         readings = _record(device, recorder, args.seconds)
     print(f"{args.file}: {recorder.bytes_written} bytes, {readings} readings", file=sys.stderr)
+    if recorder.failed:
+        raise CommandError(f"{args.file}: {recorder.failed}; what was written so far can be replayed", ENVIRONMENT)
     if readings == 0:
         raise CommandError(device.health().last_error or f"{args.device}: no reading came", NEGATIVE)
     return OK
@@ -53,7 +58,7 @@ def _record(device: Device, recorder: Recorder, seconds: float) -> int:
     has_begun, told = False, ""
     try:
         with device:
-            while time.monotonic() < end_s:
+            while time.monotonic() < end_s and not recorder.failed:
                 has_reading, error = device.read(0.2) is not None, device.health().last_error
                 if has_reading and seconds and not has_begun:
                     has_begun, end_s = True, time.monotonic() + seconds

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from agent.commands.files import written_file
+from agent.arguments import number, whole
+from agent.commands.files import writable, written_file
 from agent.commands.scan_picture import scan_picture
 from agent.commands.scan_wheels import WheelTeller
 from agent.exits import NEGATIVE, OK, USAGE, CommandError
@@ -20,6 +21,7 @@ from hw.driver import Reading
 from hw.errors import DeviceConfigError
 from hw.health import DeviceHealth
 from hw.readings import LaserScan, Odometry
+from hw.recorder import read_recording
 from hw.urls import parse_url
 
 EXAMPLES = """\
@@ -35,32 +37,48 @@ BINS = 24  # of the range histogram
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("device", metavar="DEVICE", help="for example ld06:/dev/ttyUSB0, or a wheel base")
-    parser.add_argument("-n", "--count", type=int, default=0, help="stop after so many scans (0: Ctrl-C)")
-    parser.add_argument("--seconds", type=float, default=0.0, help="stop after so long (0: Ctrl-C)")
+    parser.add_argument("-n", "--count", type=whole(0), default=0, help="stop after so many scans (0: Ctrl-C)")
+    parser.add_argument("--seconds", type=number(0), default=0.0, help="stop after so long (0: Ctrl-C)")
     parser.add_argument("--png", type=Path, metavar="FILE", help="write the last scan as a picture")
     parser.add_argument("--json", action="store_true", help="one JSON object a scan")
 
 
 def run(args: argparse.Namespace) -> int:
     try:
-        is_wheels = parse_url(args.device).scheme in schemes("wheels")
+        is_wheels = _is_base(args.device)
         device = (open_wheels if is_wheels else open_lidar)(args.device)
     except DeviceConfigError as error:
         raise CommandError(str(error), USAGE) from error
     if is_wheels and args.png:
         raise CommandError(f"--png: {args.device} sees nothing; it is a wheel base", USAGE)
+    if args.png:
+        writable(args.png)
     device.start()
     try:
         last, count = _watch(device, args)
     finally:
         device.stop()
     if last is None:
-        raise CommandError(device.health().last_error or f"{args.device}: no reading came", NEGATIVE)
+        raise CommandError(device.health().last_error or _silence(args), NEGATIVE)
     if args.png and isinstance(last, LaserScan):
         written_file(args.png, png(scan_picture(last)))
         print(f"{args.png}: {len(last.ranges_m)} beams", file=sys.stderr)
     print(f"{count} {'readings' if is_wheels else 'scans'}", file=sys.stderr)
     return OK
+
+
+def _is_base(device: str) -> bool:
+    """A recording is of what its bytes came from."""
+    url = parse_url(device)
+    if url.scheme == "replay":
+        url = parse_url(read_recording(Path(url.path)).url)
+    return url.scheme in schemes("wheels")
+
+
+def _silence(args: argparse.Namespace) -> str:
+    waited = f" in {args.seconds:g} s (some take 20 s to find the rate and start the motor)" if args.seconds else ""
+    port = parse_url(args.device).path
+    return f"{args.device}: no reading came{waited}; who answers there: mapquilt devices --probe {port}"
 
 
 def _watch(device: Source, args: argparse.Namespace) -> tuple[Reading | None, int]:

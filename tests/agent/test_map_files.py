@@ -281,3 +281,9 @@ def test_a_file_is_replaced_whole_or_not_at_all(tmp_path: Path, monkeypatch: pyt
         save_map(OccupancyGrid(CELLS[::-1], 0.1), tmp_path / "map")
     assert (pgm.read_bytes(), yaml.read_bytes()) == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["map.pgm", "map.yaml"]
+
+
+def test_an_image_that_never_ends_is_not_read(tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").write_text("image: /dev/zero\nresolution: 0.05\norigin: [0, 0, 0]\n")
+    with pytest.raises(MapFileError, match="a device or a pipe"):
+        load_map(tmp_path / "a.yaml")

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,7 +13,9 @@ import cv2
 import pytest
 
 from agent.cli import main
+from hw.recorder import read_recording
 from tests.harness.serial_device import SerialDevice
+from tests.harness.waiting import until
 
 
 @pytest.fixture
@@ -90,3 +95,54 @@ def test_what_cannot_work_is_said_in_one_sentence(tmp_path: Path, capsys: pytest
     assert "no such port" in capsys.readouterr().err
     assert main(["record", f"ld06:{tmp_path}/none", f"{tmp_path}/no/such/folder"]) == 2
     assert "cannot be written" in capsys.readouterr().err
+
+
+def test_a_recording_is_not_lost_to_a_device_that_does_not_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("agent.commands.record.START_S", 0.1)
+    (tmp_path / "a.rec").write_bytes(b"precious")
+    assert main(["record", f"ld06:{tmp_path}/none", str(tmp_path / "a.rec"), "--seconds", "0.1"]) == 1
+    assert (tmp_path / "a.rec").read_bytes() == b"precious"
+
+
+def test_a_full_disk_ends_a_recording_in_one_sentence(lidar: SerialDevice, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["record", f"ld06:{lidar.link}", "/dev/full"]) == 3
+    assert "No space left on device" in capsys.readouterr().err
+
+
+def test_sigterm_finishes_a_recording(lidar: SerialDevice, tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "agent", "record", f"ld06:{lidar.link}", str(tmp_path / "a.rec")]
+    process = subprocess.Popen(words)
+    try:
+        until(lambda: os.path.exists(tmp_path / "a.rec") and os.path.getsize(tmp_path / "a.rec") > 100, 20.0, "bytes")
+        process.terminate()
+        assert process.wait(timeout=10) == 143
+    finally:
+        process.kill()
+    assert read_recording(tmp_path / "a.rec").records
+
+
+def test_a_recording_of_wheels_is_shown_as_wheels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with SerialDevice("wt1", tmp_path / "base") as base:
+        assert main(["record", f"wheels:{base.link}", str(tmp_path / "w.rec"), "--seconds", "0.5"]) == 0
+    assert main(["scan", f"replay:{tmp_path / 'w.rec'}", "--json"]) == 0
+    assert "heading_deg" in capsys.readouterr().out
+    assert main(["map", str(tmp_path / "w.rec")]) == 4
+    assert "replay:FILE" in capsys.readouterr().err
+
+
+def test_what_has_no_bytes_cannot_be_recorded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["record", "sim:office", str(tmp_path / "a.rec")]) == 2
+    assert "mapquilt sim" in capsys.readouterr().err
+
+
+def test_a_file_is_no_serial_port(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "f").write_text("")
+    for path in (tmp_path, tmp_path / "f"):
+        assert main(["scan", f"ld06:{path}", "--seconds", "0.2"]) == 1
+        assert f"{path}: no serial port" in capsys.readouterr().err
+
+
+def test_no_port_is_an_empty_array(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("agent.commands.devices.serial_ports", list)
+    assert main(["devices", "--json"]) == 1
+    assert json.loads(capsys.readouterr().out) == []
