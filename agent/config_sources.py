@@ -86,7 +86,7 @@ def _from_file(path: Path) -> Iterable[tuple[str, str, Any]]:
             data = stream.read(MAX_FILE_BYTES + 1)
         if len(data) > MAX_FILE_BYTES:
             raise ConfigError(f"{path}: over {MAX_FILE_BYTES} bytes; is this really a settings file?")
-        table = tomllib.loads(data.decode())
+        table = tomllib.loads(data.decode("utf-8-sig"))  # Windows editors write a mark first
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror or error}; give another file with --config") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -185,6 +185,8 @@ def _suggestion(name: str) -> str:
     near = difflib.get_close_matches(last, same_section, 1, cutoff=0.5)
     if near:
         return f"; did you mean '{section}.{near[0]}'?"
+    if len(same_section) == 1:
+        return f"; [{section}] has '{section}.{same_section[0]}' only"
     elsewhere = [key for key in known if key.endswith("." + last)]
     near = elsewhere or difflib.get_close_matches(name, known, 1, cutoff=0.6)
     if near:

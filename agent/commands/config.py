@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 import json
 
-from agent.config import Value
+from agent.config import Config, Value
 from agent.config_flags import add_config_arguments, load_from
 from agent.config_sources import Loaded
-from agent.exits import OK
+from agent.exits import OK, USAGE, CommandError
 
 EXAMPLES = """\
   mapquilt config show                       every setting, as a file that can be used with --config
@@ -27,9 +27,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     loaded = load_from(args)
     if args.action == "check":
+        check(loaded.config)
         return OK
     print(as_json(loaded) if args.json else as_toml(loaded, args.origin))
     return OK
+
+
+def check(config: Config) -> None:
+    """What a start would refuse: device URLs and the network's settings; nothing is opened."""
+    from agent.runtime.network import NetworkConfigError  # noqa: PLC0415  `config show` need not load NumPy
+    from agent.runtime.settings import network_settings, wheels_url  # noqa: PLC0415
+    from hw.device import open_lidar, open_wheels  # noqa: PLC0415
+    from hw.errors import DeviceConfigError  # noqa: PLC0415
+
+    try:
+        if config.lidar.url:
+            open_lidar(config.lidar.url)
+        if config.wheels.url:
+            open_wheels(wheels_url(config))
+        network_settings(config)
+    except (DeviceConfigError, NetworkConfigError) as error:
+        raise CommandError(str(error), USAGE) from error
 
 
 def as_json(loaded: Loaded) -> str:

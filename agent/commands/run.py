@@ -14,6 +14,7 @@ import sys
 import threading
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -30,6 +31,7 @@ from agent.runtime.memory import keep_memory_small
 from agent.runtime.network import NetworkConfigError
 from agent.runtime.node import Node
 from agent.runtime.ros_bridge import MapSource, RosBridge
+from agent.runtime.state import StateTaken, held
 from hw.errors import DeviceConfigError
 
 if TYPE_CHECKING:
@@ -68,9 +70,13 @@ def run(args: argparse.Namespace) -> int:
     cv2.setNumThreads(1)  # one core is for mapping; OpenCV's own threads only get in its way
     keep_memory_small()
     stopping = StopSignals()
-    node = make_node(with_devices(config), keeps_state=not args.no_state)
-    stopping.then(node.stopping.set)
-    with exit_watchdog(node.stopping), running(node), contextlib.ExitStack() as stack:
+    folder = None if args.no_state else state_dir(config, os.environ)
+    with contextlib.ExitStack() as stack:
+        hold(folder, stack)
+        node = make_node(with_devices(config), folder)
+        stopping.then(node.stopping.set)
+        stack.enter_context(exit_watchdog(node.stopping))
+        stack.enter_context(running(node))
         page = serve_page(node.keeper, config) if config.view.enabled else None
         if page is not None:
             stack.callback(page.close)
@@ -92,8 +98,14 @@ def with_devices(config: Config) -> Config:
     return config
 
 
-def make_node(config: Config, *, keeps_state: bool) -> Node:
-    folder = state_dir(config, os.environ) if keeps_state else None
+def hold(folder: Path | None, stack: contextlib.ExitStack) -> None:
+    try:
+        stack.enter_context(held(folder))
+    except StateTaken as error:
+        raise CommandError(str(error), ENVIRONMENT) from error
+
+
+def make_node(config: Config, folder: Path | None) -> Node:
     try:
         return Node(config, folder, control_socket(config.robot.id, os.environ))
     except (DeviceConfigError, NetworkConfigError) as error:

@@ -101,6 +101,8 @@ def _device(device: Facts, colour: bool) -> str:
 def _fleet(status: Facts, before: Facts | None) -> Iterator[str]:
     group, network = status["group"], status["network"]
     together = f"one map with {', '.join(r for r in group if r != status['robot'])}" if group else "alone so far"
+    if network["profile"] == "loopback" and not (network["links"] or status["peers"]):
+        together += " (profile loopback: it meets only who is dialled with --connect; --profile lan finds others)"
     net = f"{counted(len(network['links']), 'link')}, {network['profile']}, {network['security']}"
     yield f"{printable(status['fleet'])}: {printable(together)}; {net}"
     sent, received = traffic(status)

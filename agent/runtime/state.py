@@ -10,14 +10,15 @@ be read at all, which may be the disk's fault, stays where it is.  State never k
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import hashlib
 import logging
 import os
 import re
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TypeVar
+from typing import BinaryIO, TypeVar
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -27,6 +28,31 @@ MAGIC = b"mqst"
 VERSION = 1
 KEPT = 2
 MAX_BYTES = 512 * 1024 * 1024
+
+
+class StateTaken(Exception):
+    """Another robot keeps its map in the same directory; says which, and what to do."""
+
+
+@contextlib.contextmanager
+def held(folder: Path | None) -> Iterator[None]:
+    """The directory for this process alone, until it ends however that be; a disk that knows no locks holds nobody up."""
+    with contextlib.ExitStack() as stack:
+        if folder is not None:
+            with contextlib.suppress(OSError):
+                folder.mkdir(parents=True, exist_ok=True)
+                lock = stack.enter_context((folder / "lock").open("ab"))
+                _lock(lock, folder)
+        yield
+
+
+def _lock(lock: BinaryIO, folder: Path) -> None:
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise StateTaken(
+            f"{folder}: another robot that runs keeps its map there; stop it, or give a --state-dir of its own"
+        ) from error
 
 
 class StateDirectory:

@@ -88,6 +88,7 @@ def test_the_file_of_the_user_is_found(home: dict[str, str], tmp_path: Path) -> 
         ("[matching]\nmin_factor = 0.9", "unknown key 'matching.min_factor'; did you mean 'matching.min_match_factor'?"),
         ("[mapping]\nmin_match_factor = 0.9", "did you mean 'matching.min_match_factor'?"),
         ("[maping]\nparticles = 3", "did you mean 'mapping.particles'?"),
+        ("[robot]\nname = 'r1'", "[robot] has 'robot.id' only"),
         ("[nonsense]", "unknown section [nonsense]; sections are [robot], [lidar]"),
         ("[nonsense]\nzzz = 1", "unknown key 'nonsense.zzz'; sections are [robot]"),
         ("particles = 3", "'particles' stands outside of any section; did you mean 'mapping.particles'?"),
@@ -113,6 +114,11 @@ def test_a_mistake_is_answered_with_where_and_what_was_meant(text: str, said: st
     message = complaint(file, home)
     assert message.startswith(str(file))
     assert said in message
+
+
+def test_a_mark_of_a_windows_editor_is_passed_over(home: dict[str, str], tmp_path: Path) -> None:
+    (tmp_path / "robot.toml").write_bytes(b"\xef\xbb\xbf[view]\r\nport = 9000\r\n")
+    assert load_config(tmp_path / "robot.toml", environ=home).config.view.port == 9000
 
 
 def test_a_mistake_in_the_environment_names_the_variable(home: dict[str, str]) -> None:

@@ -46,3 +46,21 @@ def test_check_is_silent_or_says_what_is_wrong(run: Run, tmp_path: Path) -> None
     file.write_text("")
     ended = run("config", "check", "--config", file)
     assert (ended.code, ended.out, ended.err) == (0, "", "")
+
+
+def test_check_finds_what_a_start_would_refuse(run: Run, tmp_path: Path) -> None:
+    file = tmp_path / "robot.toml"
+    for written, said in (
+        ('[lidar]\nurl = "ld05:/dev/ttyUSB0"', "'ld05' is no kind of lidar"),
+        ('[lidar]\nurl = "/dev/ttyUSB0"', "is no device URL"),
+        ('[wheels]\nurl = "arduino:/dev/ttyACM0"', "arduino:/dev/ttyACM0"),
+        ('[fleet]\nsecurity = "shared"', "mapquilt fleet init"),
+        ('[fleet]\nprofile = "lan"', "allow_open"),
+    ):
+        file.write_text(written)
+        ended = run("config", "check", "--config", file)
+        assert (ended.code, ended.out, said in ended.err) == (2, "", True), ended.err
+
+
+def test_the_sample_settings_pass_the_check(run: Run) -> None:
+    assert run("config", "check", "--config", Path(__file__).parents[3] / "deploy" / "robot.toml").code == 0

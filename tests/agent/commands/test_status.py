@@ -49,7 +49,12 @@ def test_a_robot_without_a_map_has_a_status(run: Run, robot: StartRobot) -> None
     )
     out = run("status").out
     assert "waiting for the first scan" in out
-    assert "alone so far" in out
+    assert "alone so far; 1 link" in out
+
+
+def test_a_robot_that_meets_nobody_says_why(run: Run, robot: StartRobot) -> None:
+    robot("r1", peers=[], group=[], network={**STATUS["network"], "profile": "loopback", "links": []})
+    assert "--profile lan finds others" in run("status").out
 
 
 def test_json_is_one_object_a_line_and_robot(run: Run, robot: StartRobot) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from agent.runtime.state import StateDirectory, pack
+from agent.runtime.state import StateDirectory, StateTaken, held, pack
 
 
 def test_the_newest_generation_comes_back_and_two_are_kept(tmp_path: Path) -> None:
@@ -70,3 +70,19 @@ def test_names_do_not_mix(tmp_path: Path) -> None:
     state.forget("map")
     assert state.load("map") is None
     assert state.load("map-old") == b"2"
+
+
+def test_two_robots_do_not_keep_their_maps_in_one_directory(tmp_path: Path) -> None:
+    with held(tmp_path / "r1"):
+        with pytest.raises(StateTaken, match="--state-dir"), held(tmp_path / "r1"):
+            pass
+        with held(tmp_path / "r2"), held(None):
+            pass
+    with held(tmp_path / "r1"):
+        pass
+
+
+def test_a_directory_that_cannot_be_made_holds_no_robot_up(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with held(tmp_path / "file" / "r1"):
+        pass
