@@ -31,6 +31,7 @@ from tests.campaigns.negative_pairs import folders, negatives
 
 REPO = Path(__file__).resolve().parents[2]
 BLOCK = 250  # pairs
+MAKERS = ("negative_pairs.py", "repeating_buildings.py")
 
 
 def judged(seed: int, block: int) -> dict[str, Any]:
@@ -53,9 +54,7 @@ def judged(seed: int, block: int) -> dict[str, Any]:
 
 def code_hash() -> str:
     """Of what decides: the code of features and merging, and which recordings there are."""
-    files = sorted(
-        [*REPO.glob("agent/features/*.py"), *REPO.glob("agent/merging/*.py"), Path(__file__).with_name("negative_pairs.py")]
-    )
+    files = sorted([*REPO.glob("agent/features/*.py"), *REPO.glob("agent/merging/*.py"), *map(Path(__file__).with_name, MAKERS)])
     told = hashlib.sha256(b"".join(path.read_bytes() for path in files))
     told.update("".join(map(str, folders())).encode())
     return told.hexdigest()[:10]

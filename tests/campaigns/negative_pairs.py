@@ -1,7 +1,7 @@
 """Pairs of maps that must not merge: other buildings, disjoint parts, mirror images, worlds that repeat.
 
-Maps come from seeded floor plans, and from the evaluation kit where BENCH_DATA (one or more folders, separated by ':') has
-been built.
+Maps come from seeded floor plans and scanned buildings (`repeating_buildings.py`), and from the evaluation kit where BENCH_DATA
+(one or more folders, separated by ':') has been built.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import numpy as np
 from agent.features.snapshot import MapSnapshot
 from protocol.geometry import SE2
 from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from tests.campaigns.repeating_buildings import ENDS, KINDS, REACH_M, seen
 from tests.harness.floorplans import office
 
 ENTRIES_HELD = 24  # pairs of the kit whose maps are kept at a time: every pair among those maps is a candidate
@@ -93,8 +94,9 @@ def _mirrored(snapshot: MapSnapshot) -> MapSnapshot:
 
 
 def drawn(rng: np.random.Generator) -> Iterator[Negative]:
-    """Pairs of drawn maps without end: other plans, mirrored plans, disjoint ends of a plan, and corridors that repeat."""
+    """Pairs of drawn maps without end: other plans, mirrored plans, disjoint ends of a plan, and what repeats."""
     while True:
+        yield from repeating(rng)
         seed = int(rng.integers(1 << 30))
         plan, other = office(seed), office(seed + 1)
         T = SE2(0.0, 0.0, float(rng.uniform(-math.pi, math.pi)))
@@ -108,6 +110,18 @@ def drawn(rng: np.random.Generator) -> Iterator[Negative]:
         yield Negative("disjoint ends of a plan", Source("left", "a", left), Source("right", "b", right))
         a, b = (Source(f"corridor {k}", k, _corridor(rng, first)) for k, first in (("a", 0), ("b", 6)))
         yield Negative("repeating corridor", a, b)
+
+
+def repeating(rng: np.random.Generator) -> Iterator[Negative]:
+    """Of one building that repeats itself: its two ends, all of it against its mirror image, and against another of its kind."""
+    build = KINDS[int(rng.integers(len(KINDS)))]
+    kind, building, other = build.__name__, build(rng), build(rng)
+    left, right = (MapSnapshot.of(seen(rng, building, part, REACH_M)) for part in ENDS)
+    ours, again = (MapSnapshot.of(seen(rng, building)) for _ in range(2))
+    whole = Source(kind, "a", ours)
+    yield Negative(f"disjoint ends of a {kind}", Source("left", "a", left), Source("right", "b", right))
+    yield Negative(f"{kind}, mirrored", whole, Source(f"{kind} mirrored", "b", _mirrored(again)))
+    yield Negative(f"another {kind}", whole, Source(f"another {kind}", "b", MapSnapshot.of(seen(rng, other))))
 
 
 def _corridor(rng: np.random.Generator, first_room: int) -> MapSnapshot:
