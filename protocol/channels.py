@@ -59,6 +59,7 @@ CHANNELS: tuple[Channel, ...] = (
     Channel(9, m.GlobalTiles, "globaltiles", "global/tiles/{base}/{target}", False, Urgency.BACKGROUND, MAX_ANSWER_BYTES),
     Channel(10, m.Manifest, "manifest", "", False, Urgency.DATA, 256),
     Channel(11, m.Chunk, "chunk", "blob/{digest}/{index}", False, Urgency.BACKGROUND, MAX_PUSH_BYTES),
+    Channel(12, m.Estate, "estate", "estate/{gone}/{digest}", False, Urgency.BACKGROUND, MAX_ANSWER_BYTES, 8_192),
 )
 BY_KIND = {channel.kind: channel for channel in CHANNELS}
 BY_NUMBER = {channel.number: channel for channel in CHANNELS}
@@ -108,6 +109,11 @@ def fine_register(base: bytes, target: bytes) -> str:
 
 def global_register(base: bytes, target: bytes) -> str:
     return f"global/tiles/{_hex(base)}/{_hex(target)}"
+
+
+def estate_register(gone: str, digest: bytes) -> str:
+    """Pull what a robot holds of one that is gone: of its map the version with this digest."""
+    return f"estate/{gone}/{_hex(digest)}"
 
 
 def chunk_register(digest: bytes, index: int) -> str:

@@ -104,10 +104,11 @@ def _check_sense(message: m.Message) -> None:
         case m.Statement():
             _check_statement(message)
         case m.Statements():
-            for statement in message.statements:
-                if (statement.robot, statement.boot) != (message.robot, message.boot):
-                    raise RemoteProtocolError(f"statements of {message.robot} hold one of {statement.robot}")
-                _check_statement(statement)
+            _check_statements(message.statements, message.robot, message.boot)
+        case m.Estate():
+            _check_statements(message.statements, message.gone, message.gone_boot)
+            if message.gone == message.robot or message.map.digest != message.delta.digest or message.delta.base_digest:
+                raise RemoteProtocolError("an estate: the whole map of another robot")
         case m.FineTiles() if message.map.digest != message.delta.digest:
             raise RemoteProtocolError("fine tiles do not lead to the map they announce")
         case m.GlobalMeta():
@@ -120,6 +121,13 @@ def _check_sense(message: m.Message) -> None:
             raise RemoteProtocolError("manifest: pieces of no size")
         case _:
             pass
+
+
+def _check_statements(statements: tuple[m.Statement, ...], robot: str, boot: int) -> None:
+    for statement in statements:
+        if (statement.robot, statement.boot) != (robot, boot):
+            raise RemoteProtocolError(f"statements of {robot} hold one of {statement.robot}")
+        _check_statement(statement)
 
 
 def _check_statement(statement: m.Statement) -> None:

@@ -8,6 +8,7 @@ How they become bytes is `protocol/codec.py`; where they travel is `protocol/cha
     MapAnnouncement, CoarseMap, FineTiles    one robot's map: its features, its outline at 20 cm, its cells
     Statement, Statements                what a robot holds true about a pair of maps
     GlobalMeta, GlobalTiles              the map of a whole group, and how to make it oneself
+    Estate                               what a robot that is gone said and mapped, from one that holds it
     Manifest, Chunk                      a large answer, pulled in pieces
 """
 
@@ -235,6 +236,20 @@ class GlobalTiles:
     delta: TileDelta
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Estate:
+    """What a robot that is gone has left: its last words and its cells, as the author of this holds them."""
+
+    robot: str  # who tells
+    boot: int
+    gone: str
+    gone_boot: int
+    is_frozen: bool
+    statements: tuple[Statement, ...]  # of the robot that is gone
+    map: MapVersion  # what you hold once `delta` is applied to nothing
+    delta: TileDelta
+
+
 @dataclass(frozen=True, slots=True)
 class Manifest:
     """The answer is large: pull its pieces from `blob/<digest>/<index>` and join them."""
@@ -279,5 +294,16 @@ class GlobalMap:
 
 
 Message = (
-    Hello | Beat | MapAnnouncement | CoarseMap | FineTiles | Statement | Statements | GlobalMeta | GlobalTiles | Manifest | Chunk
+    Hello
+    | Beat
+    | MapAnnouncement
+    | CoarseMap
+    | FineTiles
+    | Statement
+    | Statements
+    | GlobalMeta
+    | GlobalTiles
+    | Estate
+    | Manifest
+    | Chunk
 )

@@ -168,6 +168,15 @@ SCHEMAS: dict[type, tuple[Field, ...]] = {
         Field("agreeing_cells", "y", _CELLS),
     ),
     m.GlobalTiles: (*_HEAD, Field("delta", "d", _nested(TileDelta))),
+    m.Estate: (
+        *_HEAD,
+        Field("gone", "o", NAME),
+        Field("gone_boot", "O", _U64),
+        Field("is_frozen", "F", FLAG, False),
+        Field("statements", "S", list_of(_nested(m.Statement), 1_024)),
+        Field("map", "m", _MAP),
+        Field("delta", "d", _nested(TileDelta)),
+    ),
     m.Manifest: (
         *_HEAD,
         Field("digest", "d", digest(32)),

@@ -17,6 +17,7 @@ from typing import Protocol
 from agent.fleet.admission import Admission
 from agent.fleet.composition import Composition, Fused
 from agent.fleet.effects import Effect, Fetch, Fuse, Match, Send
+from agent.fleet.estates import Estates
 from agent.fleet.fetching import Fetching
 from agent.fleet.inbox import Inbox
 from agent.fleet.ledger import Ledger
@@ -62,12 +63,13 @@ class Coordinator:
         self._pairs = pairs = PairWork(ledger)
         self._composition = composition = Composition(ledger)
         self._fetching = fetching = Fetching(ledger)
-        self._inbox = Inbox(ledger, pairs, composition, fetching)
+        estates = Estates(ledger)
+        self._inbox = Inbox(ledger, pairs, composition, estates, fetching)
         self._admission = Admission(ledger, pairs)
-        self._pulling = Pulling(ledger, pairs, composition, fetching)
+        self._pulling = Pulling(ledger, pairs, composition, estates, fetching)
         self._words = OwnWords(ledger, pairs, composition)
         self._twins = TwinWatch(ledger)
-        self._registers = Registers(ledger, self._words, composition)
+        self._registers = Registers(ledger, self._words, composition, estates)
         self._overview = Overview(ledger, pairs, composition)
         self._scan_from = 0
 

@@ -8,7 +8,7 @@ from agent.fleet.effects import Fetch
 from agent.fleet.ledger import Ledger
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 3.0  # a question costs 200 B; who is lost is not asked at all
-BULK = frozenset({"coarse", "fine", "tiles"})
+BULK = frozenset({"coarse", "fine", "tiles", "estate"})
 
 
 @dataclass(slots=True)

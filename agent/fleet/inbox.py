@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from agent.fleet.composition import Composition
 from agent.fleet.consistency import is_same_drawing
+from agent.fleet.estates import Estates
 from agent.fleet.fetching import Fetching
 from agent.fleet.ledger import Ledger
 from agent.fleet.members import Peer, newer_statements, still_beats
@@ -13,6 +14,7 @@ from protocol.errors import RemoteProtocolError
 from protocol.messages import (
     Beat,
     CoarseMap,
+    Estate,
     FineTiles,
     GlobalMeta,
     GlobalTiles,
@@ -28,8 +30,9 @@ from protocol.messages import (
 class Inbox:
     """One method for each kind of message."""
 
-    def __init__(self, ledger: Ledger, pairs: PairWork, composition: Composition, fetching: Fetching) -> None:
-        self._ledger, self._pairs, self._composition, self._fetching = ledger, pairs, composition, fetching
+    def __init__(self, ledger: Ledger, pairs: PairWork, composition: Composition, estates: Estates, fetching: Fetching) -> None:
+        self._ledger, self._pairs, self._composition = ledger, pairs, composition
+        self._estates, self._fetching = estates, fetching
 
     def hear(self, message: Message, now_s: float) -> None:
         """A peer published this."""
@@ -69,6 +72,8 @@ class Inbox:
                 self._on_fine(peer, message, now_s)
             case GlobalTiles():
                 self._on_global_tiles(peer, message, now_s)
+            case Estate():
+                self._on_estate(peer, message, now_s)
             case _:
                 pass
 
@@ -145,6 +150,12 @@ class Inbox:
             self._composition.on_tiles(said)
         except RemoteProtocolError:
             self._pairs.words.strike(peer, "forged global map", now_s)
+
+    def _on_estate(self, peer: Peer, said: Estate, now_s: float) -> None:
+        try:
+            self._estates.take(said, now_s)
+        except RemoteProtocolError:
+            self._pairs.words.strike(peer, "forged map", now_s)
 
     def _check_frame(self, peer: Peer, before: MapVersion | None, now_s: float) -> None:
         frame = peer.map.frame if peer.map else None

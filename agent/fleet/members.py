@@ -71,6 +71,8 @@ class Peer:
     judged: tuple[object, ...] = ()  # what was looked at when they were held back last
     maps: History = field(default_factory=lambda: History(_KEPT_PEER_MAPS))
     versions: dict[bytes, MapVersion] = field(default_factory=dict)  # of everything in `maps`
+    told: MapVersion | None = None  # of its map, by another robot (`Estate`): itself it is gone
+    is_told_frozen: bool = False
     ghosts: dict[int, Ghost] = field(default_factory=dict)
     trust: Trust = field(default_factory=Trust)
     is_unmerged: bool = False
@@ -81,7 +83,7 @@ class Peer:
         """The newest version it is known to have."""
         beaten, announced = self.beat.map if self.beat else None, self.announcement.map if self.announcement else None
         if beaten is None or announced is None:
-            return beaten or announced
+            return beaten or announced or self.told
         return announced if announced.frame == beaten.frame and announced.revision > beaten.revision else beaten
 
     @property
@@ -96,7 +98,7 @@ class Peer:
     @property
     def is_frozen(self) -> bool:
         said = self.beat or self.announcement
-        return said is not None and said.is_frozen
+        return said.is_frozen if said is not None else self.is_told_frozen
 
     @property
     def known_area_m2(self) -> float:
@@ -123,6 +125,7 @@ class Peer:
         self.hello = self.beat = self.announcement = self.coarse = self.meta = None
         self.meta_id = NO_DIGEST
         self.statements, self.statements_seq, self.statements_digest = {}, 0, None
+        self.told, self.is_told_frozen = None, False
 
 
 class Roster:
@@ -156,7 +159,22 @@ class Roster:
             elif still_beats(peer, now_s):
                 return None  # a twin, perhaps: the life that is known is believed until it misses a beat
             self._reborn(peer, message.boot, now_s)
+        if peer.told is not None:
+            peer.forget_words()  # others said them
         peer.heard_s = now_s
+        return peer
+
+    def gone(self, robot: str, boot: int, now_s: float) -> Peer | None:
+        """The entry of a robot that others tell of and nobody hears, without its words; None when the table is full."""
+        peer = self.peers.get(robot)
+        if peer is None:
+            if len(self.peers) >= self._options.max_peers and not self._make_room():
+                return None
+            lost_s = now_s - self._options.lost_after_s
+            peer = self.peers[robot] = Peer(robot, boot, lost_s, lost_s, presence=Presence.LOST)
+            peer.is_unmerged = robot in self.unmerged
+        peer.forget_words()
+        peer.boot = boot
         return peer
 
     def accept_beat(self, peer: Peer, beat: Beat, now_s: float) -> bool:

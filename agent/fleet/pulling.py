@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from agent.fleet.composition import Composition
+from agent.fleet.estates import Estates
 from agent.fleet.fetching import Fetching
 from agent.fleet.ledger import Ledger, statements_digest
 from agent.fleet.members import Peer
 from agent.fleet.pairs import PairWork
 from agent.fleet.state import Presence
-from protocol.channels import fine_register, global_register
+from protocol.channels import estate_register, fine_register, global_register
 from protocol.messages import NO_DIGEST
 
 _GRACE_S = 0.4  # a beat may overtake the hint it speaks of
@@ -17,8 +18,9 @@ _GRACE_S = 0.4  # a beat may overtake the hint it speaks of
 class Pulling:
     """Compares what peers say they have with what is here."""
 
-    def __init__(self, ledger: Ledger, pairs: PairWork, composition: Composition, fetching: Fetching) -> None:
-        self._ledger, self._pairs, self._composition, self._fetching = ledger, pairs, composition, fetching
+    def __init__(self, ledger: Ledger, pairs: PairWork, composition: Composition, estates: Estates, fetching: Fetching) -> None:
+        self._ledger, self._pairs, self._composition = ledger, pairs, composition
+        self._estates, self._fetching = estates, fetching
 
     def pull_words(self, peer: Peer, now_s: float) -> None:
         """Small registers whose version in the beat is not the one we hold."""
@@ -43,6 +45,8 @@ class Pulling:
             peer = self._ledger.peers.get(robot)
             if peer is not None and peer.presence is not Presence.LOST:
                 self._pull_fine(peer, digest, now_s)
+        for teller, member in self._estates.wanted(now_s):
+            self._fetching.want(teller, "estate", estate_register(member.robot, member.map.digest), now_s)
         tiles = self._composition.wanted_tiles()
         if tiles is not None:
             base = self._composition.history.newest

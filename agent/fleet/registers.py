@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 
 from agent.fleet.composition import Composition
+from agent.fleet.estates import Estates
 from agent.fleet.ledger import Ledger
 from agent.fleet.own_words import OwnWords
 from protocol.codec import encode
@@ -15,8 +16,8 @@ _DIGEST = re.compile(r"-|[0-9a-f]{32}")
 class Registers:
     """Answers by key, as `protocol.channels` lays them out."""
 
-    def __init__(self, ledger: Ledger, words: OwnWords, composition: Composition) -> None:
-        self._ledger, self._words, self._composition = ledger, words, composition
+    def __init__(self, ledger: Ledger, words: OwnWords, composition: Composition, estates: Estates) -> None:
+        self._ledger, self._words, self._composition, self._estates = ledger, words, composition, estates
 
     def answer(self, key: str) -> bytes | None:
         """The encoded answer to a query on our subtree, at most 16 KB; None: there is no such register."""
@@ -40,6 +41,9 @@ class Registers:
                 return blobs.answer(self._composition.meta) if self._composition.meta else None
             case ["global", "tiles", base, target] if _DIGEST.fullmatch(base) and _DIGEST.fullmatch(target):
                 return own.global_tiles(self._composition.history, _digest(base), _digest(target))
+            case ["estate", gone, digest] if _DIGEST.fullmatch(digest):
+                estate = self._estates.of(gone, _digest(digest))
+                return blobs.answer(estate) if estate else None
             case ["blob", digest, index] if re.fullmatch(r"[0-9a-f]{64}", digest) and re.fullmatch(r"\d{1,5}", index):
                 return blobs.chunk(bytes.fromhex(digest), int(index))
         return None

@@ -11,6 +11,7 @@ from protocol.messages import (
     Beat,
     Chunk,
     CoarseMap,
+    Estate,
     Evidence,
     FineTiles,
     GlobalMember,
@@ -65,6 +66,7 @@ def examples() -> dict[str, Message]:
     head = ("amber", BOOT)
     whole = TileDelta.between(None, TileMap.of(small_grid()))
     statement = Statement(*head, 5, "birch", Stance.ACK, evidence(), bytes(range(8)), "matched")
+    words = Statement("birch", BOOT + 1, 5, "amber", Stance.ACK, evidence(), bytes(range(8)), "matched")
     members = (
         GlobalMember("amber", ours, SE2.identity(), (0.0,) * 6),
         GlobalMember("birch", theirs, SE2(1.5, -2.25, 0.75), (0.01, 0.001, 0.0, 0.02, 0.0, 0.0003)),
@@ -80,6 +82,7 @@ def examples() -> dict[str, Message]:
         "edges": Statements(*head, 5, (statement,)),
         "global": meta,
         "globaltiles": GlobalTiles(*head, whole),
+        "estate": Estate(*head, "birch", BOOT + 1, False, (words,), ours, whole),
         "manifest": Manifest(*head, bytes(range(32)), 40_000, 16_000),
         "chunk": Chunk(*head, bytes(range(32)), 2, b"piece of a map"),
     }

@@ -1,0 +1,113 @@
+"""A robot that is gone for good left its map in the global one: whoever comes later gets it from those who hold it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from agent.fleet import estates
+from agent.fleet.state import Presence
+from protocol.codec import decode, encode
+from protocol.grid import FREE, OccupancyGrid
+from protocol.messages import Beat, Estate, GlobalMeta, MapVersion, Message
+from protocol.tiles import TileDelta, TileMap
+from tests.fleet.groups import edges, fleet_of
+from tests.fleet.simulation import Fleet, Node, Tap
+
+ALL = ["r0", "r1", "r2", "r3"]
+GHOST = TileMap.of(OccupancyGrid(np.full((64, 64), FREE, np.int8), 0.5))
+
+
+def together(fleet: Fleet, here: list[str], members: list[str]) -> bool:
+    """Whether those who are here hold one global map of all members, of those too who are gone."""
+    maps = [fleet.nodes[name].global_map for name in here]
+    first = maps[0]
+    if first is None or {member.robot for member in first.members} != set(members):
+        return False
+    return all(other is not None and other.digest == first.digest and other.members == first.members for other in maps)
+
+
+def one_is_gone(gone: str, newcomer: str) -> Fleet:
+    """Three robots hold one map, one of them dies; then a newcomer comes that never heard of it."""
+    fleet = fleet_of(4, radius_m=16)
+    fleet.crash(fleet.nodes[newcomer])
+    others = [name for name in ALL if name != newcomer]
+    fleet.run_until(lambda: together(fleet, others, others), 60.0)
+    fleet.crash(fleet.nodes[gone])
+    fleet.run(20.0)
+    fleet.start(fleet.nodes[newcomer])
+    return fleet
+
+
+def test_a_newcomer_gets_the_map_of_a_robot_that_is_gone() -> None:
+    fleet = one_is_gone("r2", newcomer="r3")
+    here = ["r0", "r1", "r3"]
+    fleet.run_until(lambda: together(fleet, here, ALL), 60.0)
+    assert {key for key in edges(fleet.nodes["r3"]) if "r2" in key} == {key for key in edges(fleet.nodes["r0"]) if "r2" in key}
+
+
+def test_a_newcomer_that_composes_keeps_what_the_others_know_of_a_robot_that_is_gone() -> None:
+    fleet = one_is_gone("r2", newcomer="r0")
+    fleet.run_until(lambda: together(fleet, ["r0", "r1", "r3"], ALL), 60.0)
+
+
+def test_a_robot_that_comes_back_speaks_for_itself_again() -> None:
+    fleet = one_is_gone("r2", newcomer="r3")
+    fleet.run_until(lambda: together(fleet, ["r0", "r1", "r3"], ALL), 60.0)
+    fleet.start(fleet.nodes["r2"])
+    fleet.run_until(lambda: fleet.agrees(ALL), 60.0)
+    assert peers_of(fleet, "r3")["r2"] is Presence.ALIVE
+
+
+@pytest.mark.parametrize("witnesses", [1, 2])
+def test_one_robot_alone_invents_no_other(witnesses: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its recipe names a robot that nobody ever heard of; of the others nobody holds that map.  Were one enough, they would."""
+    monkeypatch.setattr(estates, "_WITNESSES", witnesses)
+    fleet = fleet_of(4, radius_m=16)
+    fleet.run_until(lambda: fleet.agrees(ALL), 60.0)
+    liar = fleet.nodes["r0"]
+    liar.tap = Inventor()
+    fleet.nodes["ghost"] = Node("ghost", "ghost", liar.explorer, liar.options)
+    fleet.run(20.0)
+    deceived = [name for name in ALL[1:] if "ghost" in peers_of(fleet, name)]
+    assert deceived == (ALL[1:] if witnesses == 1 else [])
+
+
+def peers_of(fleet: Fleet, name: str) -> dict[str, Presence]:
+    coordinator = fleet.nodes[name].coordinator
+    assert coordinator is not None
+    return {peer.robot: peer.presence for peer in coordinator.state(fleet.now_s).peers}
+
+
+class Inventor(Tap):
+    """Names a ghost as a member, says that it holds that map, and has an estate of it ready."""
+
+    def say(self, fleet: Fleet, node: Node, message: Message, to: str) -> list[bytes]:
+        if isinstance(message, Beat):
+            meta = self.forged(node)
+            return [encode(replace(message, global_digest=meta.id()) if meta else message)]
+        if isinstance(message, GlobalMeta):
+            return [encode(self.forged(node) or message)]
+        return super().say(fleet, node, message, to)
+
+    def answer(self, fleet: Fleet, node: Node, key: str, data: bytes | None) -> bytes | None:
+        meta = self.forged(node)
+        if meta is None or node.coordinator is None:
+            return data
+        if key == "global/meta":
+            return encode(meta)
+        if key.startswith("estate/ghost"):
+            version, cells = MapVersion(1, 1, GHOST.digest), TileDelta.between(None, GHOST)
+            return encode(Estate(node.robot, node.coordinator.boot, "ghost", 1, False, (), version, cells))
+        return data
+
+    def forged(self, node: Node) -> GlobalMeta | None:
+        assert node.coordinator is not None
+        data = node.coordinator.register("global/meta")
+        meta = decode(data) if data else None
+        if not isinstance(meta, GlobalMeta):
+            return None
+        ghost = replace(meta.members[0], robot="ghost", map=MapVersion(1, 1, GHOST.digest))
+        return replace(meta, members=(ghost, *meta.members))
