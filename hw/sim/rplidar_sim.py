@@ -26,7 +26,7 @@ class RplidarSim:
         self.baud = self.unit.baud
         self.health = wire.Health(0)
         self._inbox, self._outbox = bytearray(), bytearray()
-        self._heard_s = 0.0
+        self._begun_s = 0.0  # the request of which only a part has come
         self._turn_hz = self.unit.turn_hz
         self._mode: Mode | None = None
         self._head: Turntable | None = None
@@ -55,9 +55,10 @@ class RplidarSim:
         """See `ByteDevice`."""
         if now_s < self._booted_s:
             return
-        if now_s - self._heard_s > PATIENCE_S:
+        if now_s - self._begun_s > PATIENCE_S:
             self._inbox.clear()
-        self._heard_s = now_s
+        if not self._inbox:
+            self._begun_s = now_s
         self._inbox += data
         while self._inbox:
             request, used = wire.parse_request(self._inbox)
@@ -65,6 +66,7 @@ class RplidarSim:
                 del self._inbox[:-512]
                 return
             del self._inbox[:used]
+            self._begun_s = now_s
             if request is not None:
                 self._obey(request, now_s)
 
