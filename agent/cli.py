@@ -8,8 +8,8 @@ Who asked for `--json` gets JSON whatever happens: a failure is one object with 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import difflib
+import errno
 import importlib
 import json
 import os
@@ -18,13 +18,13 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Iterator
 from signal import default_int_handler
 from types import ModuleType
 from typing import Any, NoReturn
 
 from agent import __version__
-from agent.exits import BUG, EXIT_CODES, INTERRUPTED, OK, USAGE, CommandError
+from agent.endings import Ended, close_stdout, ending_in_order, seen_off
+from agent.exits import BUG, ENVIRONMENT, EXIT_CODES, INTERRUPTED, OK, USAGE, CommandError
 
 os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # a broken picture is told once, by us
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when NumPy loads: our matrices are small, its idle threads spin
@@ -64,6 +64,7 @@ EXAMPLES = """\
   mapquilt merge a.yaml b.yaml -o both                             two nav2 maps into one
   mapquilt map recording.clf -o out                                a CARMEN log into a map
 """
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 NEGATIVE_NUMBERS = re.compile(
     r"-\.?\d[\d.,eE+-]*$"
 )  # of one number argparse knows it; here lists of them begin with a minus, too
@@ -73,49 +74,29 @@ def main(argv: list[str] | None = None) -> int:
     """Runs one command; never raises, the return value is the exit code."""
     argv = sys.argv[1:] if argv is None else argv
     try:
-        with _ending_in_order():
+        with ending_in_order(), seen_off():
             return _dispatch(argv)
-    except _Ended as ended:
+    except Ended as ended:
         return 128 + ended.number
     except CommandError as error:
         return _failed(argv, str(error), error.code)
     except KeyboardInterrupt:
         return INTERRUPTED
     except BrokenPipeError:  # `mapquilt features map.yaml | head`: the reader has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        close_stdout()
         return OK
+    except OSError as error:
+        if error.errno not in DISK_FULL:
+            return _bug(argv, error)
+        close_stdout()
+        return _failed(argv, f"{error.strerror}, with the answer only partly written; make room and try again", ENVIRONMENT)
     except Exception as error:
-        traceback.print_exc()
-        said = f"this is a bug of ours ({type(error).__name__}: {error}); please report it with the lines above"
-        return _failed(argv, said, BUG)
+        return _bug(argv, error)
 
 
-class _Ended(BaseException):
-    """A signal asked for the end: what is open is closed on the way out, a LIDAR's motor stopped, a recording finished."""
-
-    def __init__(self, number: int) -> None:
-        self.number = number
-
-
-@contextlib.contextmanager
-def _ending_in_order() -> Iterator[None]:
-    """SIGTERM, and SIGHUP of a terminal that went away, unwind the command as Ctrl-C does; commands may have their own way."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    caught = [number for number in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(number) is signal.SIG_DFL]
-    for number in caught:
-        signal.signal(number, _end)
-    try:
-        yield
-    finally:
-        for number in caught:
-            if signal.getsignal(number) is _end:
-                signal.signal(number, signal.SIG_DFL)
-
-
-def _end(number: int, _: object) -> NoReturn:
-    raise _Ended(number)
+def _bug(argv: list[str], error: Exception) -> int:
+    traceback.print_exc()
+    return _failed(argv, f"this is a bug of ours ({type(error).__name__}: {error}); please report it with the lines above", BUG)
 
 
 def _failed(argv: list[str], message: str, code: int) -> int:

@@ -14,6 +14,7 @@ import tempfile
 import threading
 from pathlib import Path
 
+from agent.arguments import number, whole
 from agent.commands.children import ChildError
 from agent.commands.demo_fleet import Fleet
 from agent.commands.demo_show import Show
@@ -34,8 +35,10 @@ DURATION_S = 25.0  # exploring goes on this long although the maps may fit soone
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robots", type=int, default=0, metavar="N", help="how many (default: 3; a recording is cut for 2)")
     parser.add_argument("--world", default="office", help="office, outdoor, random, a world file, or log:FILE.clf[.gz]")
-    parser.add_argument("--seed", type=int, default=0, help="another building, other starts, other noise")
-    parser.add_argument("--duration", type=float, metavar="S", help="seconds of exploring (default: 25, or the whole recording)")
+    parser.add_argument("--seed", type=whole(0), default=0, help="another building, other starts, other noise")
+    parser.add_argument(
+        "--duration", type=number(0), metavar="S", help="seconds of exploring (default: 25, or the whole recording)"
+    )
     parser.add_argument(
         "--out", type=Path, default=Path("out/demo"), metavar="DIR", help="where pictures and figures go (default: out/demo)"
     )
@@ -48,8 +51,8 @@ def run(args: argparse.Namespace) -> int:
     if not 1 <= args.robots <= 20:
         raise CommandError(f"--robots {args.robots}: choose 1 to 20", USAGE)
     interrupted = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: interrupted.set())
+    for ending in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(ending, lambda *_: interrupted.set())
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="mq-")))  # short: sockets have short names
         fleet = Fleet(stack, set_stage(args, stack, folder), folder)

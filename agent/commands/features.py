@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from agent.commands.files import loaded_map, written_file
+from agent.commands.files import loaded_map, spare_inputs, written_file
 from agent.exits import OK
 from agent.features.extraction import extract_features
 from agent.features.paper import PAPER_COLUMNS, PaperFeatures, paper_features
@@ -39,6 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    if args.output is not None:
+        spare_inputs([args.output], [args.map])
     grid = loaded_map(args.map)
     features: FeatureMap | PaperFeatures = paper_features(grid) if args.method == "paper" else extract_features(grid)
     if args.output is not None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import errno
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
-from agent.exits import BAD_INPUT, ENVIRONMENT, CommandError
+from agent.exits import BAD_INPUT, ENVIRONMENT, USAGE, CommandError
 from agent.files import write_atomically
-from agent.map_files import MapFileError, load_map, save_map
+from agent.map_files import MapFileError, MapSettings, load_map, read_settings, save_map
 from protocol.grid import OccupancyGrid
 
 
@@ -25,6 +26,21 @@ def saved_map(grid: OccupancyGrid, stem: Path) -> list[Path]:
         return list(save_map(grid, stem))
     except OSError as error:
         raise _cannot_write(stem, error) from error
+
+
+def loaded_settings(path: Path) -> MapSettings:
+    try:
+        return read_settings(path)
+    except MapFileError as error:
+        raise CommandError(str(error), BAD_INPUT) from error
+
+
+def spare_inputs(outputs: Iterable[Path], maps: Iterable[Path]) -> None:
+    """Refuses to write over a map that is read: neither its YAML nor its image."""
+    read = {file.resolve() for path in maps for file in (path, path.parent / loaded_settings(path).image)}
+    for path in outputs:
+        if path.resolve() in read:
+            raise CommandError(f"{path}: this is one of the maps that are read; give another name with -o", USAGE)
 
 
 def writable(path: Path) -> Path:

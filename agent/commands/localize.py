@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from agent.commands.files import loaded_map, written_file
+from agent.commands.files import loaded_map, spare_inputs, written_file
 from agent.commands.merge_files import LoadedMap, Merged, xyt
 from agent.commands.merge_output import pair_picture
 from agent.exits import NEGATIVE, OK, PEER, CommandError
@@ -46,6 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    if args.output is not None:
+        spare_inputs([args.output], [path for path in (args.local, args.given) if path is not None])
     given = loaded_map(args.given)
     if args.local is not None:
         local, T_local_robot, name = loaded_map(args.local), None, args.local.name

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.arguments import whole
 from agent.commands.files import saved_map, writable, written_file
 from agent.exits import BAD_INPUT, NEGATIVE, OK, USAGE, CommandError
 from agent.mapping.estimate import MapEstimate
@@ -41,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--particles", type=int, metavar="N", help="hypotheses of the particle filter (default: 30)")
     parser.add_argument("--resolution", type=float, metavar="METRES", help="cell size (default: 0.05)")
     parser.add_argument("--max-range", type=float, metavar="METRES", help="longer beams are cut (default: 25)")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="the same log and seed give the same map")
+    parser.add_argument("--seed", type=whole(0), default=0, metavar="N", help="the same log and seed give the same map")
     parser.add_argument(
         "--mount", metavar="X,Y,DEG", help="where the LIDAR sits on the robot (default: what the log says, else 0,0,0)"
     )

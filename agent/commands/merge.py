@@ -11,9 +11,9 @@ import json
 import sys
 from pathlib import Path
 
-from agent.commands.files import loaded_map, writable
+from agent.commands.files import loaded_map, spare_inputs, writable
 from agent.commands.merge_files import LoadedMap, Merged, merge_files
-from agent.commands.merge_output import write_merged
+from agent.commands.merge_output import base_name, write_merged
 from agent.exits import BAD_INPUT, ENVIRONMENT, NEGATIVE, OK, USAGE, CommandError
 from agent.merging.errors import FusionError
 from agent.merging.result import MatchOptions
@@ -55,7 +55,8 @@ def run(args: argparse.Namespace) -> int:
     if args.resolution is not None and not 0.001 <= args.resolution <= 10:
         raise CommandError(f"merge: --resolution {args.resolution:g}; cells measure 0.001 to 10 m", USAGE)
     if args.output is not None:
-        writable(args.output)
+        base = base_name(writable(args.output))
+        spare_inputs([base.with_name(base.name + suffix) for suffix in (".yaml", ".pgm", ".png")], args.maps)
     maps = [LoadedMap(str(path), loaded_map(path)) for path in args.maps]
     merged = merge_files(maps, MatchOptions(method=args.method))
     written = _written(merged, args)

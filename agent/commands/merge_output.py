@@ -23,9 +23,14 @@ from agent.view.render import png
 from protocol.geometry import SE2
 
 
+def base_name(output: Path) -> Path:
+    """What the names of all files begin with."""
+    return output.with_suffix("") if output.suffix in (".yaml", ".yml", ".pgm", ".png") else output
+
+
 def write_merged(merged: Merged, output: Path, resolution_m: float | None) -> list[Path]:
     """The fused map in the first map's frame, and a picture of every pair that has a hypothesis; returns what was written."""
-    base = output.with_suffix("") if output.suffix in (".yaml", ".yml", ".pgm", ".png") else output
+    base = base_name(output)
     written: list[Path] = []
     if len(merged.T_first) > 1:
         merged.fused = _fused_in_first_frame(merged, resolution_m)

@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
 import re
 import shlex
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from agent import __version__
 from agent.cli import COMMANDS, command_parser, load_command, main
 from agent.exits import BUG, EXIT_CODES, INTERRUPTED
+from agent.map_files import save_map
+from protocol.geometry import SE2
+from protocol.grid import OccupancyGrid
 
 
 def test_every_command_is_there_with_its_help() -> None:
@@ -109,6 +115,24 @@ def test_a_reader_that_has_seen_enough_is_no_error() -> None:
         check=True,
     )
     assert (done.stdout, done.stderr) == ("{\n", "")
+
+
+@pytest.mark.parametrize("words", ["config", "config --json"])
+def test_a_full_disk_behind_stdout_is_one_sentence(words: str) -> None:
+    with Path("/dev/full").open("w") as full:
+        command = [sys.executable, "-m", "agent", *words.split()]
+        done = subprocess.run(command, check=False, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr.count("\n")) == (3, 1)
+    assert done.stderr.startswith("mapquilt: No space left on device")
+
+
+def test_letters_that_a_terminal_lacks_are_shown_as_escapes(tmp_path: Path) -> None:
+    save_map(OccupancyGrid(np.zeros((20, 20), np.int8), 0.05, SE2.identity()), tmp_path / "m")
+    (tmp_path / "m.yaml").rename(tmp_path / "räum.yaml")
+    environ = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    words = [sys.executable, "-m", "agent", "features", tmp_path / "räum.yaml"]
+    done = subprocess.run(words, check=False, capture_output=True, env=environ)
+    assert (done.returncode, b"r\\xe4um.yaml" in done.stdout) == (0, True)
 
 
 @pytest.mark.parametrize("name", list(COMMANDS))

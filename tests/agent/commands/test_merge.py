@@ -151,3 +151,14 @@ def test_maps_without_a_wall_get_an_answer(tmp_path, capsys):
     assert code == 1
     assert answer["x"] is None
     assert (tmp_path / "out.png").exists()
+
+
+@pytest.mark.parametrize("command", ["merge {a} {b} -o {a}", "merge {a} {b} -o {stem}", "features {a} -o {image}",
+    "localize {b} {a} -o {image}"])  # fmt: skip
+def test_a_map_that_is_read_is_not_written_over(maps, tmp_path, capsys, command):
+    a = save_map(load_map(maps["a"]), tmp_path / "mine")[0]
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    words = command.format(a=a, b=maps["b"], stem=a.with_suffix(""), image=a.with_suffix(".pgm")).split()
+    assert cli.main(words) == 2
+    assert "one of the maps that are read" in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
