@@ -30,6 +30,7 @@ STATUS, ERRORS, TYPE, RESET, MODE, VARIANT = b"\x31", b"\x32", b"\x3a", b"\x10",
 CONTINUOUS, POLLED, PARTIAL = bytes((MODE, 0x24)), bytes((MODE, 0x25)), bytes((MODE, 0x2A))
 ONE_SCAN, GET_CONFIG, SET_CONFIG = b"\x30\x01", 0x74, 0x77
 MEASURING_MODE_AT, UNIT_AT = 5, 6  # in the configuration
+MEASURING_MODE_IN_STATUS = 102
 RATE_CODES = {9600: 0x42, 19200: 0x41, 38400: 0x40, 500000: 0x48}
 INSTALL = bytes((MODE, 0x00)) + b"SICK_LMS"
 FIELDS = {
@@ -165,12 +166,23 @@ class SickLms(DriverBase):
             yield self._ask(bytes((MODE, RATE_CODES[self._rate])), 0xA0, 0.5)  # answered at the old rate
             yield SetBaud(self._rate)
             yield Pause(0.05)
-        config = yield self._ask(bytes((GET_CONFIG,)), 0xF4, 0.5)
-        self._measuring_mode = config[1 + MEASURING_MODE_AT] if config and len(config) > 1 + MEASURING_MODE_AT else None
+        yield from self._ask_measuring_mode()
         if self._step_deg is not None:
             yield self._ask(variant_request(100 if self._step_deg < 0.5 else 180, self._step_deg), 0xBB, 1.0)
         if (yield self._ask(CONTINUOUS, 0xA0, 1.0)) is None:
             raise DeviceSilent(f"it answers at {self.baud} baud, but will not scan")
+
+    def _ask_measuring_mode(self) -> Script:
+        """Its configuration tells it, and its status too."""
+        self._measuring_mode = None
+        for question, answer, at in (
+            (bytes((GET_CONFIG,)), 0xF4, 1 + MEASURING_MODE_AT),
+            (STATUS, 0xB1, MEASURING_MODE_IN_STATUS),
+        ):
+            told = yield self._ask(question, answer, 0.5)
+            if told is not None and len(told) > at + 1:
+                self._measuring_mode = told[at]
+                return
 
     def stop(self) -> Script:
         """See `Driver.stop`."""

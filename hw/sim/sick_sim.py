@@ -96,7 +96,7 @@ class SickSim(SickScanner):
         told[0:7] = VERSION
         told[7] = self._mode
         struct.pack_into("<H", told, 66, 4500)  # turns of the mirror a minute
-        told[101] = self._config[MEASURING_MODE_AT]
+        told[sick_lms.MEASURING_MODE_IN_STATUS - 1] = self._config[MEASURING_MODE_AT]
         struct.pack_into("<HH", told, 106, self._field_deg, round(100 * self._step_deg))
         struct.pack_into("<H", told, 115, RATE_WORDS[self.baud])
         told[121], told[122] = self._config[UNIT_AT], 1  # unit, laser

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
 
 import numpy as np
+import pytest
 
 from hw import sick_lms
+from hw.driver import Ask
+from hw.readings import LaserScan
+from hw.sick_lms import SickLms
 from hw.sim.sick_sim import SickSim
 from tests.hw.test_sim_answers import answer, sight
 
@@ -109,3 +114,25 @@ def test_a_sick_sends_means_and_sectors_of_its_scans() -> None:
         told(scanner, sick_lms.POLLED)
         scanner.emit(5.0)
     assert told(scanner, b"\x20\x26") == b"\xa0\x02\x10", "means of how many?"
+
+
+@pytest.mark.parametrize("deaf_to", [b"", b"\x74", b"\x74\x31"], ids=["answers all", "no configuration", "nor status"])
+def test_the_driver_knows_what_the_flags_in_millimetres_are_when_it_is_told(deaf_to: bytes) -> None:
+    scanner, driver = SickSim(sight()), SickLms()
+    told(scanner, sick_lms.INSTALL)
+    config = bytearray(told(scanner, bytes((sick_lms.GET_CONFIG,)))[1:-1])
+    config[sick_lms.MEASURING_MODE_AT] = 0  # 8 m, and three field flags
+    told(scanner, bytes((sick_lms.SET_CONFIG,)) + config)
+    steps = driver.start()
+    step = next(steps)
+    with contextlib.suppress(StopIteration):
+        while True:
+            if isinstance(step, Ask):
+                question = sick_lms.decode(step.data)
+                if question is not None and question[1][:1] not in [deaf_to[k : k + 1] for k in range(len(deaf_to))]:
+                    driver.feed(answer(scanner, step.data, 0.0), 5.0)
+            step = steps.send(step.until() if isinstance(step, Ask) else None)
+    flagged = sick_lms.scan_telegram([0x2000 | 3000] * 181, is_mm=True)
+    (scan,) = driver.feed(flagged, 6.0)
+    assert isinstance(scan, LaserScan)
+    assert scan.ranges_m[0] == pytest.approx(11.192 if len(deaf_to) == 2 else 3.0)
