@@ -11,7 +11,8 @@ from hw.ld06 import MODELS as LDROBOT_MODELS
 from hw.ld06 import Ld06
 from hw.rplidar import Rplidar
 from hw.rplidar_start import DEFAULT_PWM, DEFAULT_RPM, MODES
-from hw.sick_lms import RATE_CODES, SickLms
+from hw.sick_lms import SickLms
+from hw.sick_wire import RATE_CODES
 from hw.spinning import SpinningLidar
 from hw.urls import DeviceUrl
 from hw.xv11 import LDS01, XV11, Kind, Xv11

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from hw import sick_lms, wheels
+from hw import sick_wire, wheels
 
 PART_OF_TELEGRAM_S = 0.3  # half a telegram is forgotten: a SICK waits 14 ms for each byte, and a busy computer adds to that
 LATE_S = 0.5  # a host that did not look for longer missed the rest: a serial line keeps nothing
@@ -104,39 +104,39 @@ class SickScanner:
         self._heard_s = now_s
         self._inbox += data
         del self._inbox[:-4096]
-        while (start := self._inbox.find(sick_lms.STX)) >= 0 and len(self._inbox) >= start + 4:
+        while (start := self._inbox.find(sick_wire.STX)) >= 0 and len(self._inbox) >= start + 4:
             size = 6 + (self._inbox[start + 2] | self._inbox[start + 3] << 8)
             telegram = bytes(self._inbox[start : start + size])
             if len(telegram) < size <= 64:
                 return
-            decoded = sick_lms.decode(telegram) if size <= 64 else None
+            decoded = sick_wire.decode(telegram) if size <= 64 else None
             del self._inbox[: start + (size if decoded else 1)]
-            if decoded is None and 7 <= size <= 64 and telegram[1] == sick_lms.HOST_ADDRESS:
-                self._outbox.append(sick_lms.NAK)
+            if decoded is None and 7 <= size <= 64 and telegram[1] == sick_wire.HOST_ADDRESS:
+                self._outbox.append(sick_wire.NAK)
             elif decoded:
-                self._outbox += bytes((sick_lms.ACK,)) + sick_lms.encode(self._answer(decoded[1]), sick_lms.SCANNER_ADDRESS)
+                self._outbox += bytes((sick_wire.ACK,)) + sick_wire.encode(self._answer(decoded[1]), sick_wire.SCANNER_ADDRESS)
 
     def _answer(self, payload: bytes) -> bytes:
-        if payload == sick_lms.CONTINUOUS:
+        if payload == sick_wire.CONTINUOUS:
             self._is_sending = True
-        elif payload == sick_lms.POLLED:
+        elif payload == sick_wire.POLLED:
             self._is_sending = False
-        if payload[0] == sick_lms.MODE:
-            rates = {code: rate for rate, code in sick_lms.RATE_CODES.items()}
+        if payload[0] == sick_wire.MODE:
+            rates = {code: rate for rate, code in sick_wire.RATE_CODES.items()}
             self.baud = rates.get(payload[-1], self.baud) if len(payload) == 2 else self.baud  # from the answer on
             return b"\xa0\x00\x10"
-        if payload[0] == sick_lms.VARIANT:
+        if payload[0] == sick_wire.VARIANT:
             return b"\xbb\x01" + payload[1:] + b"\x10"
-        if payload in (sick_lms.STATUS, sick_lms.ERRORS):
+        if payload in (sick_wire.STATUS, sick_wire.ERRORS):
             return bytes((payload[0] | 0x80,)) + b"\x10"
-        return b"\xba" + SICK_TYPE + b"\x10" if payload == sick_lms.TYPE else NOT_UNDERSTOOD
+        return b"\xba" + SICK_TYPE + b"\x10" if payload == sick_wire.TYPE else NOT_UNDERSTOOD
 
     def emit(self, now_s: float) -> bytes:
         """See `ByteDevice`."""
         out = bytes(self._outbox)
         self._outbox.clear()
         scans = self._source.scans_until(now_s) if self._is_sending else []
-        return out + b"".join(sick_lms.scan_telegram(values) for values in scans)
+        return out + b"".join(sick_wire.scan_telegram(values) for values in scans)
 
 
 def _int32(value: int) -> int:

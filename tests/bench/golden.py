@@ -15,7 +15,7 @@ from typing import Any
 
 import cv2
 
-from hw import sick_lms
+from hw import sick_wire
 from hw.carmen import read_recording
 from hw.sim.devices import SickScanner
 from hw.sim.replay import Replay, ReplayBoard, ReplayScans
@@ -65,7 +65,7 @@ def carmen(name: str) -> golden.Run:
     for robot, replay in replays.items():
         replay.begin(golden.FIRST_S)
         devices[robot, "lidar"] = scanner = SickScanner(ReplayScans(replay))
-        scanner.receive(sick_lms.encode(sick_lms.CONTINUOUS), golden.FIRST_S)
+        scanner.receive(sick_wire.encode(sick_wire.CONTINUOUS), golden.FIRST_S)
         devices[robot, "wheels"] = ReplayBoard(replay)
     seconds = max(replay.duration_s for replay in replays.values())
     urls = {key: SICK if key[1] == "lidar" else WHEELS for key in devices}

@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from hw import ld06, rplidar_nodes, rplidar_wire, scip, sick_lms, wheels, xv11, ydlidar_wire
+from hw import ld06, rplidar_nodes, rplidar_wire, scip, sick_wire, wheels, xv11, ydlidar_wire
 from hw.driver import Driver
 from hw.readings import LaserScan
 from tests.bench.tables import markdown
@@ -36,8 +36,8 @@ PLAIN = (  # total functions from one frame's bytes to a value or None
     xv11.decode_xv11,
     xv11.decode_lds01,
     ydlidar_wire.decode,
-    sick_lms.decode,
-    sick_lms.ScanPayload.decode,
+    sick_wire.decode,
+    sick_wire.ScanPayload.decode,
     scip.decode_message,
     wheels.decode,
 )

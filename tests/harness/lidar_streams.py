@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hw import ld06, rplidar_hq, rplidar_wire, scip, sick_lms, xv11, ydlidar_wire
+from hw import ld06, rplidar_hq, rplidar_wire, scip, sick_wire, xv11, ydlidar_wire
 from hw.driver import Driver
 from hw.hokuyo import Hokuyo
 from hw.ld06 import Ld06
@@ -188,9 +188,9 @@ def hokuyo_scans(parameters: scip.Parameters = scip.UTM_30LX, seconds: float = 2
 
 def sick_scans(values: int = 361, seconds: float = 2.0, baud: int = 38400) -> Stream:
     """Continuous telegrams, as fast as the line carries them."""
-    field_deg, step_deg = sick_lms.FIELDS[values]
+    field_deg, step_deg = sick_wire.FIELDS[values]
     mm = _mm(np.arange(values) * step_deg - field_deg / 2, 1.0)
-    telegram = sick_lms.scan_telegram(_ints(mm), is_mm=True)
+    telegram = sick_wire.scan_telegram(_ints(mm), is_mm=True)
     n = max(2, int(seconds * baud / 10 / len(telegram)))
     return Stream(f"sick-{values}", SickLms, telegram * n, n * len(telegram) * 10 / baud)
 

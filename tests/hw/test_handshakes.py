@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from hw import rplidar_wire, scip, sick_lms, ydlidar_wire
+from hw import rplidar_wire, scip, sick_wire, ydlidar_wire
 from hw.driver import Driver
 from hw.health import DeviceHealth
 from hw.hokuyo import Hokuyo
@@ -198,26 +198,26 @@ class FakeSick:
         self.stream = STREAMS["sick"](seconds=1.0)
 
     def __call__(self, port: TalkingPort, data: bytes) -> None:
-        decoded = sick_lms.decode(data)
+        decoded = sick_wire.decode(data)
         assert decoded is not None
         payload = decoded[1]
-        rates = {code: baud for baud, code in sick_lms.RATE_CODES.items()}
-        if payload == sick_lms.TYPE:
+        rates = {code: baud for baud, code in sick_wire.RATE_CODES.items()}
+        if payload == sick_wire.TYPE:
             self._answer(port, b"\xbaLMS291;V02.10\x10")
-        elif payload == sick_lms.POLLED:
+        elif payload == sick_wire.POLLED:
             port.silence()
             self._answer(port, b"\xa0\x00\x10")
-        elif payload == sick_lms.CONTINUOUS:
+        elif payload == sick_wire.CONTINUOUS:
             self._answer(port, b"\xa0\x00\x10")
             port.stream(self.stream.data, 10 * self.stream.bytes_per_s)
-        elif payload[0] == sick_lms.MODE:
+        elif payload[0] == sick_wire.MODE:
             self._answer(port, b"\xa0\x00\x10")
             port._works_at = (rates[payload[1]],)
             with port._lock:  # what is said so far still goes out at the old rate
                 port._queue[:] = bytes(b ^ 0 for b in port._queue)
 
     def _answer(self, port: TalkingPort, payload: bytes) -> None:
-        port.say(bytes((sick_lms.ACK,)) + sick_lms.encode(payload, sick_lms.SCANNER_ADDRESS))
+        port.say(bytes((sick_wire.ACK,)) + sick_wire.encode(payload, sick_wire.SCANNER_ADDRESS))
 
 
 class SlowSick(FakeSick):

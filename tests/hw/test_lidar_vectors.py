@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hw import ld06, rplidar_wire, scip, sick_lms, xv11, ydlidar_wire
+from hw import ld06, rplidar_wire, scip, sick_wire, xv11, ydlidar_wire
 from hw.rplidar import Rplidar
 from hw.rplidar_nodes import Node
 
@@ -122,22 +122,22 @@ def test_scip_value(vector: dict[str, Any]) -> None:
 @pytest.mark.parametrize("vector", _of("sick_lms2xx", "frame"))
 def test_sick_telegram(vector: dict[str, Any]) -> None:
     data = bytes.fromhex(vector["hex"])
-    decoded = sick_lms.decode(data)
+    decoded = sick_wire.decode(data)
     assert decoded is not None
-    assert sick_lms.encode(decoded[1], decoded[0]) == data
+    assert sick_wire.encode(decoded[1], decoded[0]) == data
 
 
 def test_sick_requests_are_the_ones_the_driver_sends() -> None:
     by_name = {v["name"]: bytes.fromhex(v["hex"]) for v in VECTORS if v["device"] == "sick_lms2xx"}
-    assert sick_lms.encode(sick_lms.STATUS) == by_name["status"]
-    assert sick_lms.encode(sick_lms.TYPE) == by_name["type"]
-    assert sick_lms.encode(sick_lms.CONTINUOUS) == by_name["continuous on"]
-    assert sick_lms.encode(sick_lms.POLLED) == by_name["off"]
-    assert sick_lms.encode(bytes((sick_lms.MODE, sick_lms.RATE_CODES[38400]))) == by_name["38400"]
-    assert sick_lms.encode(bytes((sick_lms.MODE, sick_lms.RATE_CODES[500000]))) == by_name["500000"]
-    assert sick_lms.encode(sick_lms.INSTALL) == by_name["install mode"]
-    assert sick_lms.encode(sick_lms.variant_request(180, 0.5)) == by_name["180/0.5"]
-    assert sick_lms.encode(sick_lms.variant_request(180, 1.0)) == by_name["180/1.0"]
+    assert sick_wire.encode(sick_wire.STATUS) == by_name["status"]
+    assert sick_wire.encode(sick_wire.TYPE) == by_name["type"]
+    assert sick_wire.encode(sick_wire.CONTINUOUS) == by_name["continuous on"]
+    assert sick_wire.encode(sick_wire.POLLED) == by_name["off"]
+    assert sick_wire.encode(bytes((sick_wire.MODE, sick_wire.RATE_CODES[38400]))) == by_name["38400"]
+    assert sick_wire.encode(bytes((sick_wire.MODE, sick_wire.RATE_CODES[500000]))) == by_name["500000"]
+    assert sick_wire.encode(sick_wire.INSTALL) == by_name["install mode"]
+    assert sick_wire.encode(sick_wire.variant_request(180, 0.5)) == by_name["180/0.5"]
+    assert sick_wire.encode(sick_wire.variant_request(180, 1.0)) == by_name["180/1.0"]
 
 
 @pytest.mark.parametrize("vector", _of("neato", "decode"))

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hw import sick_wire
 from hw.carmen import Recording, read_recording
 from hw.device import open_lidar, open_wheels
 from hw.errors import DeviceConfigError
@@ -98,9 +99,8 @@ def replayed(recording: Recording, speed: float) -> tuple[list[LaserScan], list[
     scanner, board = SickScanner(ReplayScans(replay)), ReplayBoard(replay)
     driver, wheels = SickLms(500000), WheelBoard(None, 100.0)
     driver.set_baud(500000)
-    from hw import sick_lms  # noqa: PLC0415
 
-    scanner.receive(sick_lms.encode(sick_lms.CONTINUOUS), 10.0)
+    scanner.receive(sick_wire.encode(sick_wire.CONTINUOUS), 10.0)
     scans, track = [], []
     integrator = TickIntegrator(wheels.geometry)
     for k in range(int((replay.duration_s + 0.3) / 0.01)):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hw import ld06, scip, sick_lms, xv11, ydlidar_wire
+from hw import ld06, scip, sick_wire, xv11, ydlidar_wire
 from hw.hokuyo import Hokuyo
 from hw.sick_lms import SickLms
 from hw.ydlidar import YdLidar
@@ -110,11 +110,11 @@ def test_a_hokuyo_block_that_ends_in_a_semicolon_has_the_sum_of_all_its_characte
     assert not scip.is_line_good(b"a<l;" + bytes((scip.line_sum(b"a<l"),)), is_text=False)
 
 
-@pytest.mark.parametrize("n", sick_lms.FIELDS)
+@pytest.mark.parametrize("n", sick_wire.FIELDS)
 def test_sick_scans_of_every_field(n: int) -> None:
-    telegram = sick_lms.scan_telegram([500 + k % 300 for k in range(n)])
+    telegram = sick_wire.scan_telegram([500 + k % 300 for k in range(n)])
     scan = SickLms().feed(telegram, 10.0)[0]
-    field_deg, step_deg = sick_lms.FIELDS[n]
+    field_deg, step_deg = sick_wire.FIELDS[n]
     assert len(scan.ranges_m) == n
     assert np.degrees(scan.angles_rad[[0, -1]]).tolist() == pytest.approx([-field_deg / 2, field_deg / 2])
     assert np.degrees(scan.angles_rad[1] - scan.angles_rad[0]) == pytest.approx(step_deg, abs=1e-4)
@@ -123,7 +123,7 @@ def test_sick_scans_of_every_field(n: int) -> None:
 
 def test_sick_flags_and_codes_are_no_ranges() -> None:
     values = [0x2000 | 800, 0x1FF7, 0, 0x1FFF] + [800] * 177
-    metres = sick_lms.ranges_m(sick_lms.ScanPayload(tuple(values)))
+    metres = sick_wire.ranges_m(sick_wire.ScanPayload(tuple(values)))
     assert np.array_equal(metres[:5], [8.0, np.nan, np.nan, np.nan, 8.0], equal_nan=True)
 
 
@@ -133,19 +133,19 @@ def test_sick_flags_and_codes_are_no_ranges() -> None:
 ])  # fmt: skip
 def test_what_is_nothing_in_millimetres_depends_on_the_measuring_mode(mode: int | None, seen: list[float]) -> None:
     values = [8000, 0x2000 | 8000, 15999, 0x1FFF, 0x3FFF, 0x7FF7] + [8000] * 175
-    metres = sick_lms.ranges_m(sick_lms.ScanPayload(tuple(values), is_mm=True), mode)
+    metres = sick_wire.ranges_m(sick_wire.ScanPayload(tuple(values), is_mm=True), mode)
     assert np.allclose(metres[:6], seen, equal_nan=True)
 
 
 def test_a_sick_that_numbers_its_scans_is_understood() -> None:
-    numbered = sick_lms.ScanPayload((800,) * 361).encode()[:-1] + b"\x07\x10"
-    (scan,) = SickLms().feed(sick_lms.encode(numbered, sick_lms.SCANNER_ADDRESS), 1.0)
+    numbered = sick_wire.ScanPayload((800,) * 361).encode()[:-1] + b"\x07\x10"
+    (scan,) = SickLms().feed(sick_wire.encode(numbered, sick_wire.SCANNER_ADDRESS), 1.0)
     assert (scan.ranges_m == 8.0).all()
 
 
 def test_a_sick_in_a_hall_beyond_its_eight_metres_draws_no_wall_there() -> None:
     driver = SickLms()
-    assert np.isnan(driver.feed(sick_lms.scan_telegram([0x1FFF] * 181, is_mm=True), 1.0)[0].ranges_m).all()
+    assert np.isnan(driver.feed(sick_wire.scan_telegram([0x1FFF] * 181, is_mm=True), 1.0)[0].ranges_m).all()
 
 
 @settings(max_examples=50, deadline=None)
@@ -170,7 +170,7 @@ def test_ldrobot_packets(speed: int, start: int, clock_ms: int, mm: list[int]) -
 
 
 def test_on_a_bad_line_a_sick_scan_waits_until_the_next_one_begins_right_behind_it() -> None:
-    driver, telegram = SickLms(), sick_lms.scan_telegram([800] * 181)
+    driver, telegram = SickLms(), sick_wire.scan_telegram([800] * 181)
     assert len(driver.feed(telegram, 1.0)) == 1, "on a clean line at once"
     assert driver.feed(b"\0\0\0" + telegram, 2.0) == []
     assert len(driver.feed(telegram[:4], 3.0)) == 1

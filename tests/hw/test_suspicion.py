@@ -7,10 +7,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from hw import scip, sick_lms
+from hw import scip, sick_wire
 from hw.driver import Driver
 from hw.hokuyo import Hokuyo
 from hw.readings import LaserScan
+from hw.sick_lms import SickLms
 from hw.suspicion import SUSPECT_SCANS, Suspicion
 
 WALL = [2000] * 181
@@ -18,14 +19,14 @@ FORGED = [*WALL[:90], 3100, *WALL[91:]]  # one beam is wrong, and every sum will
 
 
 def sick(values: list[int]) -> bytes:
-    return sick_lms.scan_telegram(values, is_mm=True)
+    return sick_wire.scan_telegram(values, is_mm=True)
 
 
 def hokuyo(values: list[int]) -> bytes:
     return scip.encode_scan(b"MD0000018001000", 0, values)
 
 
-@pytest.mark.parametrize(("driver", "encode"), [(sick_lms.SickLms(), sick), (Hokuyo(), hokuyo)], ids=["sick", "hokuyo"])
+@pytest.mark.parametrize(("driver", "encode"), [(SickLms(), sick), (Hokuyo(), hokuyo)], ids=["sick", "hokuyo"])
 def test_a_forged_beam_is_left_out_long_after_the_line_was_damaged(driver: Driver, encode: Callable[[list[int]], bytes]) -> None:
     damaged = bytearray(encode(WALL))
     del damaged[50:55]
