@@ -26,6 +26,10 @@ TEXT
 
 say() { printf 'mapquilt: %s\n' "$*"; }
 stop() { printf 'mapquilt: %s\n' "$2" >&2; exit "$1"; }
+folder() { # option path
+    [ -d "$2" ] || stop 4 "$1 $2: no such directory"
+    readlink -f -- "$2"
+}
 
 here=$(dirname "$(readlink -f -- "$0")")
 source=${here%/*}
@@ -33,9 +37,9 @@ root='' robot='' wheelhouse='' keys='' action=install purge=no
 while [ $# -gt 0 ]; do
     case $1 in
         --robot) robot=${2:?--robot needs an id}; shift ;;
-        --wheelhouse) wheelhouse=$(readlink -f -- "${2:?--wheelhouse needs a directory}"); shift ;;
-        --keys) keys=$(readlink -f -- "${2:?--keys needs a directory}"); shift ;;
-        --root) root=$(readlink -f -- "${2:?--root needs a directory}"); shift ;;
+        --wheelhouse) wheelhouse=$(folder "$1" "${2:?--wheelhouse needs a directory}"); shift ;;
+        --keys) keys=$(folder "$1" "${2:?--keys needs a directory}"); shift ;;
+        --root) root=$(readlink -m -- "${2:?--root needs a directory}"); shift ;;
         --uninstall) action=uninstall ;;
         --purge) purge=yes ;;
         -h | --help) usage; exit 0 ;;
@@ -46,6 +50,7 @@ done
 case $robot in *[!a-z0-9_-]* | [_-]*) stop 2 "--robot '$robot': use a-z, 0-9, '-' and '_', first a letter or digit" ;; esac
 
 home=$root/opt/mapquilt
+before=$home.before
 settings=$root/etc/mapquilt
 group=mapquilt-keys
 command=$root/usr/local/bin/mapquilt
@@ -74,6 +79,29 @@ place() { # mode source target
     mv -f "$3.new" "$3"
 }
 
+# What a program consists of: its rooms, and what installs its packages.
+parts='agent protocol hw run requirements.lock requirements-dev.lock pyproject.toml LICENSE'
+
+keep_old_program() {
+    rm -rf "$before"
+    [ -d "$home/agent" ] || return 0
+    mkdir -p "$before"
+    for part in $parts; do
+        [ ! -e "$home/$part" ] || cp -Rp "$home/$part" "$before/$part"
+    done
+}
+
+# A robot whose update fails goes on as it was: with the program that fits the packages it has.
+go_back() {
+    [ -d "$before" ] || stop 3 "the packages could not be installed (see above), so nothing is; with --wheelhouse it must be of this version: deploy/wheelhouse.sh"
+    for part in $parts; do
+        rm -rf "${home:?}/$part"
+        [ ! -e "$before/$part" ] || mv "$before/$part" "$home/$part"
+    done
+    rm -rf "$before"
+    stop 3 "the packages could not be installed (see above); the version of before is in place again. With --wheelhouse it must be of the new version: deploy/wheelhouse.sh"
+}
+
 place_program() {
     mkdir -p "$home"
     for room in agent protocol hw; do
@@ -95,7 +123,8 @@ place_packages() {
         export PIP_NO_INDEX PIP_FIND_LINKS UV_NO_INDEX UV_FIND_LINKS UV_OFFLINE
     fi
     # The system's own Python first: one below /root or /home is out of the service's sight.
-    PATH=/usr/bin:/bin:/usr/local/bin:$PATH "$home/run" --version
+    PATH=/usr/bin:/bin:/usr/local/bin:$PATH "$home/run" --version || go_back
+    rm -rf "$before"
     case $(readlink -f "$home/.venv/bin/python") in
         /root/* | /home/*) [ -n "$root" ] || stop 3 "only a Python in somebody's home was found, which a service may not read; install one with: apt-get install python3 python3-venv" ;;
     esac
@@ -162,7 +191,7 @@ uninstall() {
     if systemd_runs; then
         systemctl list-units --all --plain --no-legend 'mapquilt@*' | while read -r name _; do systemctl disable --now "$name" || true; done
     fi
-    rm -rf "$home"
+    rm -rf "$home" "$before"
     rm -f "$command" "$unit" "$rules" "$drivers" "$completion" "$page"
     ! systemd_runs || systemctl daemon-reload
     if [ "$purge" = yes ]; then
@@ -179,6 +208,7 @@ if [ "$action" = uninstall ]; then
     uninstall
     exit 0
 fi
+keep_old_program
 place_program
 place_packages
 place_settings

@@ -89,13 +89,20 @@ def state(machine: Machine) -> Iterator[Finding]:
     folder = state_dir(machine.config, machine.environ)
     there = next(path for path in (folder, *folder.parents) if path.exists())
     if not os.access(there, os.W_OK):
-        yield Finding(Level.FAIL, "state", f"{there} cannot be written: maps would be lost", f"sudo chown {machine.user} {there}")
+        yield Finding(Level.FAIL, "state", f"{there} cannot be written: maps would be lost", _made_writable(there, machine.user))
         return
     free_mb = shutil.disk_usage(there).free // 2**20
     if free_mb < DISK_MB:
         yield Finding(Level.WARN, "state", f"{folder}: {free_mb} MB free on this disk", "sudo apt-get clean")
     else:
         yield ok("state", f"{folder} ({free_mb} MB free)")
+
+
+def _made_writable(folder: Path, user: str) -> str:
+    if os.statvfs(folder).f_flag & os.ST_RDONLY:
+        mount = next(path for path in (folder, *folder.parents) if path.is_mount())
+        return f"sudo mount -o remount,rw {mount}"
+    return f"chmod u+rwx {folder}" if folder.owner() == user else f"sudo chown {user} {folder}"
 
 
 def descriptors(machine: Machine) -> Iterator[Finding]:

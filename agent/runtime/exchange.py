@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import threading
 import time
 from collections.abc import Sequence
@@ -99,7 +100,7 @@ class Exchange:
         except zenoh.ZError as error:
             listen = ", ".join(self.settings.endpoints()) or "nothing"
             raise ExchangeError(
-                f"network: cannot open (listen {listen}, connect {', '.join(connect) or 'nothing'}): {error}. "
+                f"network: cannot open (listen {listen}, connect {', '.join(connect) or 'nothing'}): {plain(error)}. "
                 "Is the port free, and does the router answer?"
             ) from error
         try:
@@ -213,6 +214,11 @@ class Exchange:
 
 class ExchangeError(Exception):
     """The network could not be opened: the program says so and stops, because a dead mesh looks healthy from inside."""
+
+
+def plain(error: Exception) -> str:
+    """What Zenoh says, without where in its source it said so."""
+    return re.sub(r" at /\S+\.rs:\d+\.?", "", str(error)).rstrip(". ")
 
 
 def close(session: Any) -> None:

@@ -51,7 +51,7 @@ def _lock(lock: BinaryIO, folder: Path) -> None:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
         raise StateTaken(
-            f"{folder}: another robot that runs keeps its map there; stop it, or give a --state-dir of its own"
+            f"{folder}: another robot that runs keeps its map there; stop it, or choose another --id or --state-dir"
         ) from error
 
 

@@ -102,6 +102,24 @@ def test_a_wheelhouse_is_the_only_source_of_packages(source: Path, target: Path,
     assert f"find-links {house}" in install(source, "--root", target, "--wheelhouse", house).stdout
 
 
+def test_an_update_whose_packages_fail_leaves_the_version_of_before(source: Path, target: Path) -> None:
+    install(source, "--root", target)
+    before = files(target)
+    (source / "agent" / "new.py").write_text("")
+    (source / "requirements.lock").write_text("msgpack==99")
+    (source / "run").write_text("#!/bin/sh\nexit 3\n")
+    done = install(source, "--root", target)
+    assert done.returncode == 3
+    assert "the version of before is in place again" in done.stderr
+    assert files(target) == before
+
+
+def test_a_folder_that_is_not_there_is_said(source: Path, target: Path) -> None:
+    for option in ("--wheelhouse", "--keys"):
+        done = install(source, "--root", target, option, target / "no" / "such")
+        assert (done.returncode, done.stderr) == (4, f"mapquilt: {option} {target}/no/such: no such directory\n")
+
+
 def test_keys_are_for_the_service_only(source: Path, target: Path, tmp_path: Path) -> None:
     bundle = tmp_path / "robot-1"
     bundle.mkdir()

@@ -107,6 +107,9 @@ def test_a_state_directory_that_cannot_be_written(machine: Machine, monkeypatch:
     assert only(checks.state, asked).level is Level.WARN
     monkeypatch.setattr(os, "access", lambda *_: False)
     assert only(checks.state, asked).finding == f"{there} cannot be written: maps would be lost"
+    assert only(checks.state, asked).mend == f"sudo chown pi {there}"
+    owned = dataclasses.replace(asked, user=there.owner())
+    assert only(checks.state, owned).mend == f"chmod u+rwx {there}"  # one's own folder, and a chown changes nothing
 
 
 def test_a_page_whose_port_is_taken(machine: Machine, robot: Callable[..., FakeRobot]) -> None:

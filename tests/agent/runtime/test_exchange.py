@@ -133,8 +133,9 @@ def test_a_bug_in_answering_costs_one_answer() -> None:
 
 def test_the_same_port_twice_is_one_clear_sentence(hub: Exchange) -> None:
     (locator,) = hub.locators()
-    with pytest.raises(ExchangeError, match="Is the port free"):
+    with pytest.raises(ExchangeError, match="Is the port free") as refused:
         Exchange(NetworkSettings("other", listen=(locator,)), nothing).open()
+    assert "Address already in use" in str(refused.value) and ".rs:" not in str(refused.value), "where, not in whose source"
 
 
 def test_a_dead_seed_does_not_keep_a_robot_from_starting(hub: Exchange) -> None:
