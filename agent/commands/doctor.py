@@ -7,6 +7,7 @@ import getpass
 import grp
 import json
 import os
+import shlex
 import sys
 from collections.abc import Iterator
 
@@ -14,6 +15,7 @@ from agent.commands.doctor_checks import CHECKS
 from agent.commands.doctor_findings import Finding, Level, Machine
 from agent.config import Config
 from agent.config_flags import add_config_arguments, load_from
+from agent.config_sources import config_file
 from agent.exits import NEGATIVE, OK, CommandError
 from agent.terminal import has_colour, painted, printable
 
@@ -51,10 +53,22 @@ def examined(args: argparse.Namespace) -> Iterator[Finding]:
         config = loaded.config
         yield Finding(Level.OK, "settings", str(loaded.file or "none written: the defaults"))
     except CommandError as error:
-        yield Finding(Level.FAIL, "settings", str(error), "mapquilt config show > robot.toml")
+        yield Finding(Level.FAIL, "settings", str(error), _mend_of_settings(str(error), args.config))
     machine = Machine(config, os.environ, groups=own_groups(), user=own_name())
     for check in CHECKS:
         yield from check(machine)
+
+
+def _mend_of_settings(complaint: str, given: str | None) -> str:
+    """A complaint begins with where the mistake was made: in a variable, a flag or the file."""
+    where = complaint.partition(":")[0]
+    if where.startswith("$"):
+        return f"unset {where[1:]}"
+    if where.startswith("--"):
+        return "mapquilt doctor --help"
+    file = config_file(given, os.environ)
+    editor = "nano" if file is None or os.access(file if file.exists() else file.absolute().parent, os.W_OK) else "sudo nano"
+    return f"{editor} {shlex.quote(str(file))}"
 
 
 def as_text(finding: Finding, *, colour: bool) -> str:

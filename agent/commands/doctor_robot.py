@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import socket
 import stat
@@ -68,10 +69,14 @@ def security(machine: Machine) -> Iterator[Finding]:
                 "mapquilt fleet init keys",
             )
     elif fleet.security == "shared":
-        yield _private_file("security", "fleet key", fleet.key_file)
+        path = shlex.quote(fleet.key_file)
+        mend = f"cp keys/fleet.key {path}  (made once, for all robots: mapquilt fleet init keys)"
+        yield _private_file("fleet key", fleet.key_file, mend if fleet.key_file else "mapquilt fleet init keys")
     else:
         folder = Path(fleet.certificates)
-        yield _private_file("security", "private key", str(folder / f"{machine.config.robot.id}.key"))
+        robot = machine.config.robot.id
+        mend = f"mapquilt fleet enroll keys {robot} && cp keys/bundles/{robot}/* {shlex.quote(str(folder))}"
+        yield _private_file("private key", str(folder / f"{robot}.key"), mend)
         for name in ("ca.pem", f"{machine.config.robot.id}.pem"):
             yield _certificate(folder / name)
 
@@ -100,18 +105,18 @@ def _socket_of(machine: Machine) -> Path:
     return running_robots(machine.environ).get(robot) or control_socket(robot, machine.environ)
 
 
-def _private_file(what: str, name: str, path: str) -> Finding:
+def _private_file(name: str, path: str, mend: str) -> Finding:
     try:
         mode = Path(path).stat().st_mode
     except OSError as error:
-        return Finding(Level.FAIL, what, f"{name} {path or '(none given)'}: {error.strerror}", "mapquilt fleet init keys")
+        return Finding(Level.FAIL, "security", f"{name} {path or '(none given)'}: {error.strerror}", mend)
     if mode & stat.S_IRWXO:
-        return Finding(Level.FAIL, what, f"{name} {path} can be read by everybody", f"chmod o-rwx {path}")
+        return Finding(Level.FAIL, "security", f"{name} {path} can be read by everybody", f"chmod o-rwx {shlex.quote(path)}")
     if not os.access(path, os.R_OK):
         return Finding(
-            Level.WARN, what, f"{name} {path} cannot be read by this user", f"sudo -u {Path(path).owner()} mapquilt doctor"
+            Level.WARN, "security", f"{name} {path} cannot be read by this user", f"sudo -u {Path(path).owner()} mapquilt doctor"
         )
-    return ok(what, f"{name} {path}")
+    return ok("security", f"{name} {path}")
 
 
 def _certificate(path: Path) -> Finding:

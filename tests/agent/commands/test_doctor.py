@@ -195,8 +195,16 @@ def test_the_command_tells_everything_and_ends_with_1_when_something_failed(run:
         "level": "FAIL",
         "what": "security",
         "finding": "fleet key /none: No such file or directory",
-        "mend": "mapquilt fleet init keys",
+        "mend": "cp keys/fleet.key /none  (made once, for all robots: mapquilt fleet init keys)",
     } in found
+
+
+def test_what_mends_settings_is_where_the_mistake_was_made(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "my robot.toml").write_text("[lidr]\nurl = 1\n")
+    assert f"mend: nano '{tmp_path}/my robot.toml'\n" in run("doctor", "--config", tmp_path / "my robot.toml").out
+    assert "mend: mapquilt doctor --help\n" in run("doctor", "--view-port", "x").out
+    monkeypatch.setenv("MAPQUILT_LIDAR__ULR", "x")
+    assert "mend: unset MAPQUILT_LIDAR__ULR\n" in run("doctor").out
 
 
 def test_settings_that_cannot_be_read_are_a_finding(run: Run, tmp_path: Path) -> None:
