@@ -97,7 +97,10 @@ class Recording:
 def read_recording(path: Path) -> Recording:
     """Read a file; one that was cut off is good up to there."""
     try:
-        data = path.read_bytes()
+        with path.open("rb") as stream:
+            data = stream.read(len(MAGIC) + 1)
+            if data.startswith(MAGIC):  # what is none may have no end, as /dev/zero
+                data += stream.read()
     except OSError as error:
         raise DeviceConfigError(f"{path}: cannot be read: {error.strerror}; is this the recording's name?") from error
     end = data.find(b"\n", len(MAGIC))

@@ -42,17 +42,28 @@ class ControlServer:
     def start(self) -> None:
         if len(os.fsencode(self.path)) > 100:  # sun_path holds 108 bytes
             raise ControlError(f"{self.path}: too long for a unix socket; set XDG_RUNTIME_DIR to a shorter directory")
-        self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        self._refuse_a_twin()
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            self._refuse_a_twin()
+            self._socket = self._bound()
+        except OSError as error:
+            said = f"{self.path}: cannot be made ({error.strerror or error}); set XDG_RUNTIME_DIR to a directory of your own"
+            raise ControlError(said) from error
+        self._thread.start()
+
+    def _bound(self) -> socket.socket:
+        bound = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         previous = os.umask(0o177)
         try:
-            self._socket.bind(str(self.path))
+            bound.bind(str(self.path))
+            bound.listen(8)
+        except OSError:
+            bound.close()
+            raise
         finally:
             os.umask(previous)
-        self._socket.listen(8)
-        self._socket.settimeout(0.25)
-        self._thread.start()
+        bound.settimeout(0.25)
+        return bound
 
     def _refuse_a_twin(self) -> None:
         """A socket nobody answers is left over from a crash; one that answers is another agent with our name."""

@@ -80,6 +80,8 @@ def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
     (tmp_path / "x").write_bytes(b"FLASER 180 1.0")
     with pytest.raises(DeviceConfigError, match="is no recording"):
         open_lidar(f"replay:{tmp_path / 'x'}")
+    with pytest.raises(DeviceConfigError, match="is no recording"):
+        open_lidar("replay:/dev/zero")  # which has no end
     with pytest.raises(DeviceConfigError, match="cannot be read"):
         open_lidar(f"replay:{tmp_path / 'none'}")
     with pytest.raises(DeviceConfigError, match="is no kind of lidar"):

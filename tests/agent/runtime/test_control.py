@@ -79,3 +79,11 @@ def test_a_socket_left_by_a_crash_is_taken_over(tmp_path: Path) -> None:
 def test_no_agent_is_one_clear_sentence(tmp_path: Path) -> None:
     with pytest.raises(ControlError, match="start one with mapquilt run"):
         ask(tmp_path / "none.sock", "status")
+
+
+def test_a_socket_that_cannot_be_made_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    server = ControlServer(tmp_path / "file" / "r.sock", {})
+    with pytest.raises(ControlError, match="set XDG_RUNTIME_DIR"):
+        server.start()
+    server.close()
