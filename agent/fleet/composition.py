@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Protocol
 
-from agent.fleet.credibility import objection
+from agent.fleet.credibility import leaves_out, objection
 from agent.fleet.effects import Changed, Fuse
 from agent.fleet.frame_graph import Group
 from agent.fleet.ledger import Ledger
@@ -24,6 +24,7 @@ from protocol.messages import GlobalMap, GlobalMeta, GlobalTiles
 from protocol.tiles import TileMap
 
 _KEPT_GLOBAL_MAPS = 6
+_KEPT_IDS = 32
 _RECIPE_WAIT_S = 2.5
 _FUSING_SHARE = 4.0  # a pause of this many times what the last fusion took: large groups on slow machines compose less often
 _PATIENCE_S = 10.0  # without a usable recipe for this long, each makes its own
@@ -52,6 +53,7 @@ class Composition:
         self.meta: GlobalMeta | None = None  # what we published last
         self.root = ledger.robot
         self.composer = ledger.robot
+        self.let_go: set[str] = set()  # robots that are gone and in no recipe of ours
         self._made: Recipe | None = None  # what `global_map` was made from
         self._running: tuple[int, Recipe, float] | None = None
         self._composed_s = -1e9
@@ -59,6 +61,8 @@ class Composition:
         self._grouped_s: float | None = None  # since when we are not alone
         self._followed_s: float | None = None  # since when there was a usable recipe, or we began to wait for one
         self._objection = ""  # to the composer's recipe
+        self._left_out_s: float | None = None  # since when that recipe has no map of a robot that is gone
+        self._known_ids: deque[bytes] = deque(maxlen=_KEPT_IDS)  # of the maps we held last
         self._seq = 0
 
     def step(self, now_s: float) -> list[MissingMap]:
@@ -105,12 +109,16 @@ class Composition:
         self._adopt(recipe, tiles, fused.conflicting_cells, fused.agreeing_cells)
 
     def awaits_meta(self, robot: str) -> bool:
-        """Whether a peer of our group holds a global map whose frame we should know before we make our own.
+        """Whether a peer of our group holds a global map that we should know: before we make our own, or while we are at odds.
 
         What the composer, or anybody who holds the same map, told us of it is enough.
         """
-        group = self._ledger.group
-        return self.global_map is None and group is not None and holds_unknown_map(self._ledger, group, robot)
+        ledger, group = self._ledger, self._ledger.group
+        is_at_odds = self.composer == ledger.robot or bool(self._objection)
+        if group is None or not (self.global_map is None or is_at_odds) or not holds_unknown_map(ledger, group, robot):
+            return False
+        beat = ledger.peers[robot].beat
+        return beat is not None and beat.global_digest not in self._known_ids
 
     # Composing.
 
@@ -123,7 +131,7 @@ class Composition:
         if now_s - self._composed_s >= self._pause_s(group):
             self._composed_s = now_s
             admitted = {ledger.robot: ledger.own.version, **{peer.robot: peer.admitted for peer in peers}}
-            versions = {robot: version for robot, version in admitted.items() if version is not None}
+            versions = {robot: version for robot, version in admitted.items() if version is not None and robot not in self.let_go}
             recipe = written(ledger, group, root_of(ledger, group, self.global_map, self.root), versions)
             if recipe is not None and recipe != self._made:
                 self._fuse(recipe, now_s)
@@ -161,6 +169,7 @@ class Composition:
             conflicting_cells,
             agreeing_cells,
         )
+        self._known_ids.append(self.meta.id())
         if self.composer == ledger.robot and len(encode(self.meta)) <= MAX_PUSH_BYTES:
             ledger.send(self.meta)
 
@@ -174,6 +183,8 @@ class Composition:
         self._ledger.own.pinned = ours.map.digest if ours is not None else b""
         if meta is None or self._objects_to(meta, group):
             return self._compose(group, now_s) if now_s - self._followed_s > _PATIENCE_S else []
+        if self._awaits_the_gone(meta, group, now_s):
+            return []
         self._followed_s = now_s
         if len(meta.members) > self._ledger.options.max_held_maps:
             return []
@@ -183,6 +194,14 @@ class Composition:
         if not missing:
             self._fuse(Recipe.of(meta), now_s)
         return [(robot, digest) for robot, digest in missing if robot != self._ledger.robot]
+
+    def _awaits_the_gone(self, meta: GlobalMeta, group: Group, now_s: float) -> bool:
+        """A composer that never heard of a robot that is gone learns of it from the map that we go on holding; for a while."""
+        if not leaves_out(self._ledger, meta, group):
+            self._left_out_s = None
+            return False
+        self._left_out_s = now_s if self._left_out_s is None else self._left_out_s
+        return now_s - self._left_out_s < _PATIENCE_S
 
     def _recipe_of_composer(self) -> GlobalMeta | None:
         peer = self._ledger.peers.get(self.composer)

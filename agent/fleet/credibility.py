@@ -41,6 +41,12 @@ def objection(ledger: Ledger, meta: GlobalMeta, group: Group) -> str:
     return ""
 
 
+def leaves_out(ledger: Ledger, meta: GlobalMeta, group: Group) -> bool:
+    """Whether this recipe lacks a robot that is gone, and whose map we hold: its author may have come too late to hear of it."""
+    gone = [peer for peer in ledger.peers.values() if peer.presence is Presence.LOST and peer.robot in group.T_root]
+    return any(peer.admitted is not None and meta.member(peer.robot) is None for peer in gone)
+
+
 def _is_outvoted(ledger: Ledger, meta: GlobalMeta, group: Group, refused: set[str]) -> bool:
     """Whether enough others hold this very map."""
     others = [ledger.peers[robot] for robot in group.T_root.keys() - refused - {ledger.robot, meta.robot}]
