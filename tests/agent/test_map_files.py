@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -47,6 +47,7 @@ def written(tmp_path: Path, yaml: str, pgm: bytes | None = None) -> Path:
     return tmp_path / "map.yaml"
 
 
+@settings(suppress_health_check=[HealthCheck.too_slow])  # a busy machine draws arrays slowly, and that is no bug
 @given(
     cells=hnp.arrays(np.int8, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9), elements=st.sampled_from([-1, 0, 100])),
     resolution_m=st.floats(0.001, 10.0),
