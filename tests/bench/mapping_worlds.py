@@ -113,7 +113,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--seeds", default="0,1,2")
     parser.add_argument("--worlds", default="office,random")
-    parser.add_argument("--variations", default="plain", help=f"or all: {', '.join(VARIATIONS)}")
+    parser.add_argument("--variations", default="plain", help=f"or all: {', '.join(VARIATIONS)}".replace("%", "%%"))
     parser.add_argument("--particles", type=int, default=30)
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
