@@ -21,6 +21,7 @@ from agent.fleet.estates import Estates
 from agent.fleet.fetching import Fetching
 from agent.fleet.inbox import Inbox
 from agent.fleet.ledger import Ledger
+from agent.fleet.letting_go import LettingGo
 from agent.fleet.members import Peer
 from agent.fleet.memory import FleetMemory
 from agent.fleet.options import FleetOptions
@@ -68,6 +69,7 @@ class Coordinator:
         self._admission = Admission(ledger, pairs)
         self._pulling = Pulling(ledger, pairs, composition, estates, fetching)
         self._words = OwnWords(ledger, pairs, composition)
+        self._letting_go = LettingGo(ledger, pairs.words, composition)
         self._twins = TwinWatch(ledger)
         self._registers = Registers(ledger, self._words, composition, estates)
         self._overview = Overview(ledger, pairs, composition)
@@ -164,6 +166,7 @@ class Coordinator:
                 self._admission.admit(peer, now_s)
         self._pairs.next_job(turn, now_s)
         self._pulling.pull_maps(turn, now_s)
+        self._letting_go.check(now_s)
 
     def _next_peers(self) -> list[Peer]:
         """Everybody, in fleets of ordinary size; larger ones take turns."""

@@ -111,7 +111,8 @@ class Ledger:
         """Look again whether the edge between two robots lives."""
         key = pair_key(a, b)
         evidence = agreed(self.statement(*key), self.statement(key[1], key[0]))
-        if evidence is not None and not (self.is_current(evidence) and self.is_trusted(a, now_s) and self.is_trusted(b, now_s)):
+        is_believed = self.is_trusted(a, now_s) and self.is_trusted(b, now_s)
+        if evidence is not None and not (is_believed and self.is_current(evidence) and self._is_borne_out(evidence)):
             evidence = None
         if evidence == self.live.get(key):
             return
@@ -127,6 +128,12 @@ class Ledger:
         if a in self._connected or b in self._connected:
             self._is_layout_old = True
             self.timetable.next_scan_s = now_s
+
+    def _is_borne_out(self, evidence: Evidence) -> bool:
+        """Whether edges of robots that others tell of lie where the recipe has them, by which they are believed."""
+        peers = [self.peers[robot] for robot in (evidence.robot_a, evidence.robot_b) if robot in self.peers]
+        laid = [peer.told.T_between(evidence.robot_a, evidence.robot_b) for peer in peers if peer.told is not None]
+        return all(self.is_same(T, evidence.T_a_b) for T in laid)
 
     def judge_all(self, robot: str, now_s: float) -> None:
         """Look again at every edge of one robot."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from agent.fleet.options import FleetOptions
@@ -39,6 +40,21 @@ class Ghost:
     heard_s: float = 0.0
 
 
+@dataclass(frozen=True, slots=True)
+class Told:
+    """A robot that is gone, as others tell of it (`Estate`)."""
+
+    map: MapVersion
+    is_frozen: bool
+    witnesses: int  # who held the recipe that names it
+    by: frozenset[str]  # who told
+    T_global: Mapping[str, SE2]  # where that recipe lays it and everybody else
+
+    def T_between(self, a: str, b: str) -> SE2 | None:
+        """T_a_b, as the recipe has it."""
+        return self.T_global[a].inverse() @ self.T_global[b] if a in self.T_global and b in self.T_global else None
+
+
 @dataclass(slots=True)
 class Peer:
     """One other robot."""
@@ -71,8 +87,7 @@ class Peer:
     judged: tuple[object, ...] = ()  # what was looked at when they were held back last
     maps: History = field(default_factory=lambda: History(_KEPT_PEER_MAPS))
     versions: dict[bytes, MapVersion] = field(default_factory=dict)  # of everything in `maps`
-    told: MapVersion | None = None  # of its map, by another robot (`Estate`): itself it is gone
-    is_told_frozen: bool = False
+    told: Told | None = None  # what others say of it: itself it is gone
     ghosts: dict[int, Ghost] = field(default_factory=dict)
     trust: Trust = field(default_factory=Trust)
     is_unmerged: bool = False
@@ -83,7 +98,7 @@ class Peer:
         """The newest version it is known to have."""
         beaten, announced = self.beat.map if self.beat else None, self.announcement.map if self.announcement else None
         if beaten is None or announced is None:
-            return beaten or announced or self.told
+            return beaten or announced or (self.told.map if self.told is not None else None)
         return announced if announced.frame == beaten.frame and announced.revision > beaten.revision else beaten
 
     @property
@@ -98,7 +113,9 @@ class Peer:
     @property
     def is_frozen(self) -> bool:
         said = self.beat or self.announcement
-        return said.is_frozen if said is not None else self.is_told_frozen
+        if said is None:
+            return self.told is not None and self.told.is_frozen
+        return said.is_frozen
 
     @property
     def known_area_m2(self) -> float:
@@ -125,7 +142,7 @@ class Peer:
         self.hello = self.beat = self.announcement = self.coarse = self.meta = None
         self.meta_id = NO_DIGEST
         self.statements, self.statements_seq, self.statements_digest = {}, 0, None
-        self.told, self.is_told_frozen = None, False
+        self.told = None
 
 
 class Roster:

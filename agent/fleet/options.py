@@ -35,6 +35,7 @@ class FleetOptions:
     max_edges: int = 6  # per robot: enough loops to find a wrong edge, few enough to keep verified
     max_held_maps: int = 24  # larger groups take the global map from its composer instead of every member's map
     max_peers: int = 1_024  # a fleet of a thousand; a table full of strangers that announce 600 lines each costs 17 MB
+    max_told: int = 64  # robots that nobody hears, taken on the word of others: as many maps are held for them
     min_match_factor: float = 0.85  # the paper's; equation (3)
     same_transform_m: float = 0.5  # two transforms of one pair are the same within these
     same_transform_rad: float = 0.06

@@ -10,8 +10,9 @@ import pytest
 from agent.fleet import estates
 from agent.fleet.state import Presence
 from protocol.codec import decode, encode
+from protocol.geometry import SE2
 from protocol.grid import FREE, OccupancyGrid
-from protocol.messages import Beat, Estate, GlobalMeta, MapVersion, Message
+from protocol.messages import NO_DIGEST, Beat, Estate, GlobalMeta, MapVersion, Message, Stance, Statement, Statements
 from protocol.tiles import TileDelta, TileMap
 from tests.fleet.groups import edges, fleet_of
 from tests.fleet.simulation import Fleet, Node, Tap
@@ -111,3 +112,54 @@ class Inventor(Tap):
             return None
         ghost = replace(meta.members[0], robot="ghost", map=MapVersion(1, 1, GHOST.digest))
         return replace(meta, members=(ghost, *meta.members))
+
+
+@pytest.mark.parametrize("lie", ["hides", "moves"])
+def test_one_heir_alone_neither_hides_nor_moves_a_robot_that_is_gone(lie: str) -> None:
+    fleet = one_is_gone("r2", newcomer="r3")
+    fleet.nodes["r1"].tap = FalseHeir(lie)
+    fleet.run_until(lambda: "r2" in frames(fleet, "r3"), 60.0)
+    fleet.run(10.0)
+    coordinator = fleet.nodes["r3"].coordinator
+    assert coordinator is not None
+    about = [e for e in coordinator.state(fleet.now_s).edges if "r2" in (e.robot_a, e.robot_b)]
+    assert about and all(e.T_a_b.distance_m(fleet.true_T(e.robot_a, e.robot_b)) < 0.5 for e in about)
+
+
+def test_a_robot_that_only_one_other_knew_is_let_go() -> None:
+    """The others never heard it, it cannot be asked any more, and one witness is not enough."""
+    fleet = fleet_of(4, radius_m=16)
+    fleet.blocked |= {("r2", "r0"), ("r2", "r3"), ("r0", "r2"), ("r3", "r2")}
+    fleet.run_until(lambda: "r2" in frames(fleet, "r1"), 60.0)
+    fleet.crash(fleet.nodes["r2"])
+    here = ["r0", "r1", "r3"]
+    fleet.run_until(lambda: all(frames(fleet, name) == set(here) for name in here) and together(fleet, here, here), 90.0)
+
+
+def frames(fleet: Fleet, name: str) -> set[str]:
+    coordinator = fleet.nodes[name].coordinator
+    assert coordinator is not None
+    return set(coordinator.state(fleet.now_s).frames)
+
+
+class FalseHeir(Tap):
+    """Says of a robot that is gone that it was merged with nobody, or that it agreed to lie three metres from where it lies."""
+
+    def __init__(self, lie: str) -> None:
+        self.lie = lie
+
+    def answer(self, fleet: Fleet, node: Node, key: str, data: bytes | None) -> bytes | None:
+        said = decode(data) if data else None
+        if isinstance(said, Estate):
+            words = () if self.lie == "hides" else tuple(map(moved, said.statements))
+            return encode(replace(said, statements=words))
+        if isinstance(said, Statements) and self.lie == "moves":
+            return encode(replace(said, statements=tuple(map(moved, said.statements))))
+        return data
+
+
+def moved(said: Statement) -> Statement:
+    if {said.robot, said.other} != {"r1", "r2"}:
+        return said
+    evidence = replace(said.evidence, T_a_b=said.evidence.T_a_b @ SE2(3.0, 0.0, 0.0))
+    return replace(said, stance=Stance.ACK, evidence=evidence, holds=NO_DIGEST)
