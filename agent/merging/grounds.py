@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from agent.features.snapshot import MapSnapshot
 from agent.merging.result import MatchFactor
 from agent.merging.transforms import Poses
-from agent.merging.validation import doubts, evidence, match_factor
+from agent.merging.validation import doubts, evidence, match_factor, turning
 from agent.merging.verdict import Grounds, rival_score
 from agent.merging.views import witness
 
@@ -31,5 +31,6 @@ def weighed(
         factor.value,
         max(ours.working.resolution_m, theirs.working.resolution_m),
         *doubts(witness(ours), witness(theirs), poses[best]),
+        turning(witness(ours), witness(theirs), poses[best]),
     )
     return grounds, factor, overlap_m2, found.score_m, order

@@ -63,6 +63,7 @@ class MatchOptions:
     min_agreeing_m: float = 8.0  # of firm wall
     max_rival_share: float = 0.72  # of the best score
     near_rival_share: float = 0.45  # above it the building may repeat itself: what merges then has no flaw
+    round_rival_share: float = 0.25  # above it, what says little about how the maps are turned must be far ahead
     min_observability_m: float = 2.0  # of wall that fixes the worst-seen direction, and
     min_observable_share: float = 0.1  # of agreeing wall: along a long corridor two metres of cross wall are an accident
     unsuspicious: float = 0.3  # most true pairs look less like another place of the same kind; above it more margin is asked for

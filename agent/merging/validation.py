@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -34,6 +35,7 @@ DECISION_WORTH: Worths = (
     (0.65, -1.9, -1.2, -0.5),  # long
 )
 
+FAR_OFF = 1e-3  # of the wall: a point so far off that turning about it is sliding does not count as one
 DEEP_M = 0.45  # a wall this far from any of theirs, in their free space, is no misalignment
 
 
@@ -99,6 +101,26 @@ def doubts(ours: Witness, theirs: Witness, pose: NDArray[np.float64]) -> tuple[f
         deep += np.count_nonzero(away > DEEP_M)
     agreeing = max(agreeing, 0.5)
     return float(attached[0] / max(attached[1], 0.5)), float(deep / agreeing), 0.5 * SPACING_M * float(distinct)
+
+
+def turning(ours: Witness, theirs: Witness, pose: NDArray[np.float64]) -> float:
+    """Metres of agreeing wall that say how the maps are turned, about whichever point says least; the worse direction.
+
+    A round hall agrees with itself however it is turned about its middle.  Each point counts by how much of its way, were
+    the map turned about that point, is along its normal.
+    """
+    least = math.inf
+    for points, on, T in ((theirs, ours, pose[None]), (ours, theirs, inverted(pose[None]))):
+        agrees = OUTCOMES.take(readings(on.field.fine, on.field.resolution_m, points.probe, T))[0] == AGREES
+        n, at = (values[agrees].astype(np.float64) for values in (points.thin.normals, points.thin.positions_m))
+        if not len(n):
+            return 0.0
+        at -= at.mean(axis=0)
+        swept = at[:, 0] * n[:, 1] - at[:, 1] * n[:, 0]  # along the normals, turned about the middle
+        moved = -np.linalg.solve(n.T @ n + FAR_OFF * len(n) * np.eye(2), n.T @ swept)  # and what undoes most of that
+        way = moved @ moved + np.mean(np.sum(at**2, axis=1)) + 1e-9
+        least = min(least, SPACING_M * float(np.sum((swept + n @ moved) ** 2) / way))
+    return least
 
 
 def match_factor(ours: WorkingGrid, theirs: WorkingGrid, pose: NDArray[np.float64]) -> tuple[MatchFactor, float]:

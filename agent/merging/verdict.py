@@ -29,6 +29,8 @@ MARGIN_PER_GRAVE_SUSPICION_M = 45.0  # mirrored parts of a building at 1.2 were 
 MIN_DISTINCT_M = 4.0  # two ends of a building share long walls; what tells them apart is short,
 CLEAR_MARGIN_M = 25.0  # unless nothing else comes near: ends that were merged wrongly were ahead by 7 to 13 m
 FLAW = 0.002  # of `deep_doubt`: more than none
+ROUND_M = 16.0  # so much wall, of which
+ROUND_SHARE = 0.28  # less than this says how the maps are turned, is a round hall or racking: its ends merged up to 0.27
 REPEATED_SHARE, REPEATED_M = 0.6, 24.0  # a rival of this share of the score and so much wall is no accident
 
 
@@ -47,6 +49,7 @@ class Grounds:
     attached_doubt: float
     deep_doubt: float
     distinct_m: float  # agreeing wall that is no long wall
+    turning_m: float  # agreeing wall that says how the maps are turned
 
     @property
     def suspicion(self) -> float:
@@ -87,7 +90,7 @@ def verdict(grounds: Grounds, options: MatchOptions) -> tuple[MatchStatus, str]:
         return MatchStatus.AMBIGUOUS, Reason.RIVAL
     is_bare = g.distinct_m < MIN_DISTINCT_M and g.score - g.rival < CLEAR_MARGIN_M
     grave_m = options.min_margin_m + MARGIN_PER_GRAVE_SUSPICION_M * (g.suspicion - GRAVE_SUSPICION)
-    if g.is_refuted or is_bare or g.score - g.rival <= grave_m or _is_one_of_many(g, options):
+    if g.is_refuted or is_bare or g.score - g.rival <= grave_m or _is_one_of_many(g, options) or _is_round(g, options):
         return MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE
     return MatchStatus.MERGED, Reason.MATCHED
 
@@ -102,6 +105,16 @@ def _is_one_of_many(g: Grounds, options: MatchOptions) -> bool:
     if share <= options.near_rival_share:
         return False
     return g.deep_doubt > FLAW or (share > REPEATED_SHARE and g.rival > REPEATED_M)
+
+
+def _is_round(g: Grounds, options: MatchOptions) -> bool:
+    """Whether the maps may as well be turned about some place, and nearly are in another hypothesis.
+
+    Two ends of a rotunda agree along its round walls, and walls between its rooms fall on each other by accident.
+    """
+    if g.agreeing_m < ROUND_M or g.turning_m > ROUND_SHARE * g.agreeing_m:
+        return False
+    return g.rival > options.round_rival_share * g.score and g.score - g.rival < CLEAR_MARGIN_M
 
 
 def _needed_margin_m(g: Grounds, options: MatchOptions) -> float:

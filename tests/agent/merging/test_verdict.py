@@ -21,6 +21,7 @@ GOOD = Grounds(
     attached_doubt=0.05,
     deep_doubt=0.01,
     distinct_m=20.0,
+    turning_m=20.0,
 )
 # what two parts of a building had to say for each other, one of them turned over
 MIRRORED_PARTS = {"score": 22.6, "rival": 2.6, "factor": 0.94, "attached_doubt": 0.29, "deep_doubt": 0.08}
@@ -36,6 +37,18 @@ HOTEL = {
     "deep_doubt": 0.005,
 }
 CORRIDOR = {"score": 21.5, "rival": 14.9, "agreeing_m": 25.9, "against_m": 0.2, "potential_m": 22.7, "deep_doubt": 0.0}
+# two ends of a rotunda, and of a building of which as little says how it is turned, without a rival
+ROTUNDA = {
+    "score": 21.9,
+    "rival": 7.6,
+    "agreeing_m": 30.1,
+    "against_m": 0.4,
+    "potential_m": 24.0,
+    "factor": 0.99,
+    "distinct_m": 9.2,
+    "deep_doubt": 0.0,
+    "turning_m": 6.0,
+}
 
 
 def test_good_grounds_merge() -> None:
@@ -49,6 +62,11 @@ def test_long_walls_alone_merge_when_no_rival_comes_near() -> None:
 def test_a_near_rival_does_not_hurt_what_is_flawless() -> None:
     assert verdict(replace(GOOD, rival=20.0, deep_doubt=0.0), MatchOptions()) == (MatchStatus.MERGED, Reason.MATCHED)
     assert verdict(replace(GOOD, **CORRIDOR), MatchOptions()) == (MatchStatus.MERGED, Reason.MATCHED)
+
+
+def test_what_hardly_says_how_it_is_turned_merges_without_a_rival() -> None:
+    assert verdict(replace(GOOD, **(ROTUNDA | {"rival": 3.0})), MatchOptions()) == (MatchStatus.MERGED, Reason.MATCHED)
+    assert verdict(replace(GOOD, **(ROTUNDA | {"turning_m": 10.0})), MatchOptions()) == (MatchStatus.MERGED, Reason.MATCHED)
 
 
 def test_little_but_long_walls_must_be_less_suspicious() -> None:
@@ -72,6 +90,7 @@ def test_little_but_long_walls_must_be_less_suspicious() -> None:
         ({"factor": 0.88, "attached_doubt": 0.6, "deep_doubt": 0.05}, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
         ({"rival": 20.0}, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
         ({"rival": 26.0, "deep_doubt": 0.0}, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
+        (ROTUNDA, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
         (HOTEL, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
         (MIRRORED_PARTS, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
     ],
