@@ -1,4 +1,4 @@
-"""Twelve ways to lie to a fleet: each is an honest robot until `from_s`, and then this."""
+"""Fourteen ways to lie to a fleet: each is an honest robot until `from_s`, and then this."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 from protocol.codec import decode, encode
 from protocol.geometry import SE2
 from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from protocol.messages import Beat, FineTiles, GlobalMeta, Message, Stance, Statement
-from protocol.tiles import TileDelta
+from protocol.messages import Beat, Estate, FineTiles, GlobalMeta, MapVersion, Message, Stance, Statement
+from protocol.tiles import TileDelta, TileMap
 from tests.fleet.explorer import Explorer
 from tests.fleet.simulation import Fleet, Node, Tap
 
@@ -232,6 +232,43 @@ class Reincarnation(_WordAttack):
         return [encode(message)]
 
 
+_GHOST = TileMap.of(OccupancyGrid(np.full((64, 64), FREE, np.int8), 0.5))
+
+
+class InventedRobot(_WordAttack):
+    """Names a ghost as a member, says that it holds that map, and has an estate of it ready."""
+
+    is_detectable = False  # nobody believes it, so nobody needs to prove it
+
+    def say(self, fleet: Fleet, node: Node, message: Message, to: str) -> list[bytes]:
+        if isinstance(message, Beat):
+            meta = self.forged(node)
+            return [encode(replace(message, global_digest=meta.id()) if meta else message)]
+        if isinstance(message, GlobalMeta):
+            return [encode(self.forged(node) or message)]
+        return super().say(fleet, node, message, to)
+
+    def answer(self, fleet: Fleet, node: Node, key: str, data: bytes | None) -> bytes | None:
+        meta = self.forged(node)
+        if meta is None or node.coordinator is None:
+            return data
+        if key == "global/meta":
+            return encode(meta)
+        if key.startswith("estate/ghost"):
+            version, cells = MapVersion(1, 1, _GHOST.digest), TileDelta.between(None, _GHOST)
+            return encode(Estate(node.robot, node.coordinator.boot, "ghost", 1, False, (), version, cells))
+        return data
+
+    def forged(self, node: Node) -> GlobalMeta | None:
+        assert node.coordinator is not None
+        data = node.coordinator.register("global/meta")
+        meta = decode(data) if data else None
+        if not isinstance(meta, GlobalMeta):
+            return None
+        ghost = replace(meta.members[0], robot="ghost", map=MapVersion(1, 1, _GHOST.digest))
+        return replace(meta, members=(ghost, *meta.members))
+
+
 ATTACKS: dict[str, type[Attack]] = {
     "shifted map": ShiftedMap,
     "mirrored map": MirroredMap,
@@ -246,4 +283,5 @@ ATTACKS: dict[str, type[Attack]] = {
     "garbage": Garbage,
     "false recipes": FalseRecipes,
     "reincarnation": Reincarnation,
+    "invented robot": InventedRobot,
 }

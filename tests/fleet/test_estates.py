@@ -4,21 +4,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from agent.fleet import estates
 from agent.fleet.state import Presence
 from protocol.codec import decode, encode
 from protocol.geometry import SE2
-from protocol.grid import FREE, OccupancyGrid
-from protocol.messages import NO_DIGEST, Beat, Estate, GlobalMeta, MapVersion, Message, Stance, Statement, Statements
-from protocol.tiles import TileDelta, TileMap
+from protocol.messages import NO_DIGEST, Estate, Stance, Statement, Statements
+from tests.fleet.attackers import InventedRobot
 from tests.fleet.groups import edges, fleet_of
 from tests.fleet.simulation import Fleet, Node, Tap
 
 ALL = ["r0", "r1", "r2", "r3"]
-GHOST = TileMap.of(OccupancyGrid(np.full((64, 64), FREE, np.int8), 0.5))
 
 
 def together(fleet: Fleet, here: list[str], members: list[str]) -> bool:
@@ -69,7 +66,7 @@ def test_one_robot_alone_invents_no_other(witnesses: int, monkeypatch: pytest.Mo
     fleet = fleet_of(4, radius_m=16)
     fleet.run_until(lambda: fleet.agrees(ALL), 60.0)
     liar = fleet.nodes["r0"]
-    liar.tap = Inventor()
+    liar.tap = InventedRobot()
     fleet.nodes["ghost"] = Node("ghost", "ghost", liar.explorer, liar.options)
     fleet.run(20.0)
     deceived = [name for name in ALL[1:] if "ghost" in peers_of(fleet, name)]
@@ -80,38 +77,6 @@ def peers_of(fleet: Fleet, name: str) -> dict[str, Presence]:
     coordinator = fleet.nodes[name].coordinator
     assert coordinator is not None
     return {peer.robot: peer.presence for peer in coordinator.state(fleet.now_s).peers}
-
-
-class Inventor(Tap):
-    """Names a ghost as a member, says that it holds that map, and has an estate of it ready."""
-
-    def say(self, fleet: Fleet, node: Node, message: Message, to: str) -> list[bytes]:
-        if isinstance(message, Beat):
-            meta = self.forged(node)
-            return [encode(replace(message, global_digest=meta.id()) if meta else message)]
-        if isinstance(message, GlobalMeta):
-            return [encode(self.forged(node) or message)]
-        return super().say(fleet, node, message, to)
-
-    def answer(self, fleet: Fleet, node: Node, key: str, data: bytes | None) -> bytes | None:
-        meta = self.forged(node)
-        if meta is None or node.coordinator is None:
-            return data
-        if key == "global/meta":
-            return encode(meta)
-        if key.startswith("estate/ghost"):
-            version, cells = MapVersion(1, 1, GHOST.digest), TileDelta.between(None, GHOST)
-            return encode(Estate(node.robot, node.coordinator.boot, "ghost", 1, False, (), version, cells))
-        return data
-
-    def forged(self, node: Node) -> GlobalMeta | None:
-        assert node.coordinator is not None
-        data = node.coordinator.register("global/meta")
-        meta = decode(data) if data else None
-        if not isinstance(meta, GlobalMeta):
-            return None
-        ghost = replace(meta.members[0], robot="ghost", map=MapVersion(1, 1, GHOST.digest))
-        return replace(meta, members=(ghost, *meta.members))
 
 
 @pytest.mark.parametrize("lie", ["hides", "moves"])
