@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from agent.fleet.ledger import Ledger
-from agent.fleet.members import Told
+from agent.fleet.members import Peer, Told
 from agent.fleet.recipe import tiles_of
 from agent.fleet.state import Presence
 from protocol.messages import NO_DIGEST, Estate, GlobalMember, GlobalMeta
@@ -42,6 +42,7 @@ class Estates:
         """(who can tell, which map) of robots that are gone and whose maps are in the global map, but not here."""
         for teller, member, _, _ in self._missing(now_s):
             yield teller, member
+        yield from self._other_versions(now_s)
 
     def take(self, said: Estate, now_s: float) -> None:
         """Somebody told; what it tells of a robot that is here, or of a map that nobody else holds, is left.
@@ -52,6 +53,8 @@ class Estates:
             if (teller, member.robot, member.map) == (said.robot, said.gone, said.map):
                 self._believe(said, meta, witnesses, now_s)
                 return
+        if any((teller, m.robot, m.map) == (said.robot, said.gone, said.map) for teller, m in self._other_versions(now_s)):
+            self._take_cells(self._ledger.peers[said.gone], said)
 
     def _believe(self, said: Estate, meta: GlobalMeta, witnesses: int, now_s: float) -> None:
         tiles, ledger = said.delta.apply(None), self._ledger
@@ -72,6 +75,29 @@ class Estates:
         peer.statements = words
         ledger.note("estate", peer=said.gone, of=said.robot)
         ledger.judge_all(said.gone, now_s)
+
+    def _take_cells(self, peer: Peer, said: Estate) -> None:
+        """One more version of a map that is joined to ours; whether it may enter the global map is asked as of any other."""
+        tiles = said.delta.apply(None)
+        peer.maps.add(tiles, needed=peer.admitted.digest if peer.admitted is not None else NO_DIGEST)
+        if peer.holds(said.map):
+            peer.versions[said.map.digest] = said.map
+        else:
+            peer.hold(said.map, tiles.grid())
+
+    def _other_versions(self, now_s: float) -> Iterator[tuple[str, GlobalMember]]:
+        """(who can tell, which map) of robots that died between two pulls: others hold cells that never came here."""
+        ledger, group = self._ledger, self._ledger.group
+        for teller in self._here(now_s):
+            meta = teller.meta
+            if group is None or meta is None or len(meta.members) > ledger.options.max_held_maps:
+                continue
+            for member in meta.members:
+                peer = ledger.peers.get(member.robot)
+                if peer is None or peer.presence is not Presence.LOST or peer.map is None or member.robot not in group.T_root:
+                    continue
+                if peer.map.frame == member.map.frame and tiles_of(ledger, member.robot, member.map.digest) is None:
+                    yield teller.robot, member
 
     def _missing(self, now_s: float) -> Iterator[tuple[str, GlobalMember, GlobalMeta, int]]:
         """(who can tell, which map, in which recipe, how many hold it at least)."""
@@ -107,13 +133,15 @@ class Estates:
 
     def _witnessed(self, now_s: float) -> Iterator[tuple[GlobalMeta, list[str]]]:
         """Recipes of maps that enough of those who are here and joined to us hold, and who they are."""
-        ledger, group = self._ledger, self._ledger.group
-        if group is None:
-            return
-        joined = [ledger.peers[robot] for robot in sorted(group.T_root) if robot in ledger.peers]
-        here = [peer for peer in joined if peer.presence is not Presence.LOST and ledger.is_trusted(peer.robot, now_s)]
+        here = self._here(now_s)
         metas = {peer.meta_id: peer.meta for peer in here if peer.meta is not None and peer.meta_id != NO_DIGEST}
         for meta_id, meta in metas.items():
             tellers = [peer.robot for peer in here if peer.beat is not None and peer.beat.global_digest == meta_id]
             if tellers and len(tellers) >= min(_WITNESSES, len(here)):
                 yield meta, tellers
+
+    def _here(self, now_s: float) -> list[Peer]:
+        """Those who are here, believed and joined to us."""
+        ledger, group = self._ledger, self._ledger.group
+        joined = [ledger.peers[robot] for robot in sorted(group.T_root) if robot in ledger.peers] if group is not None else []
+        return [peer for peer in joined if peer.presence is not Presence.LOST and ledger.is_trusted(peer.robot, now_s)]
