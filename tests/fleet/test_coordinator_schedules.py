@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from tests.fleet.departures import run_departure
 from tests.fleet.schedules import run_schedule
 
 
@@ -12,3 +13,8 @@ from tests.fleet.schedules import run_schedule
 def test_the_invariants_hold_whatever_breaks(seed: int) -> None:
     outcome = run_schedule(seed)
     assert outcome.wrong_edges == 0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_those_who_are_left_end_with_one_map_when_a_robot_dies_for_good(seed: int) -> None:
+    assert run_departure(seed).connected >= 2
