@@ -13,8 +13,8 @@ from typing import Protocol
 from agent.fleet.credibility import leaves_out, objection
 from agent.fleet.effects import Changed, Fuse
 from agent.fleet.frame_graph import Group
+from agent.fleet.history import History
 from agent.fleet.ledger import Ledger
-from agent.fleet.own_map import History
 from agent.fleet.recipe import Recipe, grid_of, tiles_of, written
 from agent.fleet.succession import composer_of, holds_unknown_map, recipes_of, root_of
 from protocol.channels import MAX_PUSH_BYTES

@@ -66,14 +66,3 @@ def _walls_against(walls_of: OccupancyGrid, free_of: OccupancyGrid, T: SE2, step
 
 def _thinned(cells: NDArray[np.int64]) -> NDArray[np.int64]:
     return cells[:: max(1, -(-len(cells) // _MAX_CELLS))]
-
-
-def coarsened(grid: OccupancyGrid, resolution_m: float) -> OccupancyGrid:
-    """The grid at about `resolution_m`: occupied where anything is, else free where anything is."""
-    factor = max(1, round(resolution_m / grid.resolution_m))
-    if factor == 1:
-        return grid
-    height, width = -(-grid.height // factor), -(-grid.width // factor)
-    padded = np.full((height * factor, width * factor), UNKNOWN, np.int8)
-    padded[: grid.height, : grid.width] = grid.cells
-    return OccupancyGrid(padded.reshape(height, factor, width, factor).max(axis=(1, 3)), grid.resolution_m * factor, grid.origin)

@@ -181,9 +181,8 @@ class Coordinator:
     def unmerge(self, peer: str, now_s: float) -> Sequence[Effect]:
         """The operator takes a peer out of our map, until `readmit`."""
         now_s = self._ledger.clock.at(now_s)
-        known = self._ledger.peers.get(peer)
-        if known is not None and not known.is_unmerged:
-            known.is_unmerged = True
+        if peer not in self._ledger.roster.unmerged:
+            self._ledger.roster.unmerged.add(peer)
             self._pairs.words.withdraw(peer, "unmerged by the operator", now_s)
             self._ledger.judge_all(peer, now_s)
             self._ledger.note("unmerged", peer=peer)
@@ -193,9 +192,9 @@ class Coordinator:
     def readmit(self, peer: str, now_s: float) -> Sequence[Effect]:
         """The operator allows a peer again: ends `unmerge` and quarantine."""
         now_s = self._ledger.clock.at(now_s)
+        self._ledger.roster.unmerged.discard(peer)
         known = self._ledger.peers.get(peer)
         if known is not None:
-            known.is_unmerged = False
             known.trust.pardon()
             self._pairs.pairs.pop(peer, None)
             self._ledger.judge_all(peer, now_s)
@@ -205,13 +204,13 @@ class Coordinator:
         """What to keep over a restart; see `recall`."""
         ledger = self._ledger
         places = {e.other(self.robot): ledger.from_our_side(e) for key, e in ledger.live.items() if self.robot in key}
-        unmerged = tuple(sorted(peer.robot for peer in ledger.peers.values() if peer.is_unmerged))
+        unmerged = tuple(sorted(ledger.roster.unmerged))
         return FleetMemory(self._words.epoch, {**self._pairs.words.remembered, **places}, unmerged)
 
     def recall(self, memory: FleetMemory) -> None:
         """At the start: verify these transforms before anything is searched for."""
         self._pairs.words.remembered = dict(memory.T_ours_theirs)
-        self._words.recalled_epoch = memory.epoch
+        self._words.epoch = self._words.recalled_epoch = memory.epoch
         self._ledger.roster.unmerged = set(memory.unmerged)
 
     def register(self, key: str) -> bytes | None:

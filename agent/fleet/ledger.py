@@ -70,8 +70,10 @@ class Ledger:
 
     def is_trusted(self, robot: str, now_s: float) -> bool:
         """Whether a robot's words count here."""
+        if robot == self.robot:
+            return True
         peer = self.peers.get(robot)
-        return robot == self.robot or (peer is not None and not peer.is_unmerged and not peer.trust.is_quarantined(now_s))
+        return peer is not None and robot not in self.roster.unmerged and not peer.trust.is_quarantined(now_s)
 
     def frame_of(self, robot: str) -> int | None:
         """The map frame a robot draws in now."""

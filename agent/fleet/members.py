@@ -7,8 +7,8 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from agent.fleet.history import History
 from agent.fleet.options import FleetOptions
-from agent.fleet.own_map import History
 from agent.fleet.state import Presence
 from agent.fleet.trust import Trust
 from protocol.geometry import SE2
@@ -90,7 +90,6 @@ class Peer:
     told: Told | None = None  # what others say of it: itself it is gone
     ghosts: dict[int, Ghost] = field(default_factory=dict)
     trust: Trust = field(default_factory=Trust)
-    is_unmerged: bool = False
     presence: Presence = Presence.ALIVE
 
     @property
@@ -153,7 +152,7 @@ class Roster:
         self.peers: dict[str, Peer] = {}
         self.restarted: list[str] = []  # robots whose boot changed since this list was emptied
         self.joined: list[str] = []
-        self.unmerged: set[str] = set()  # by the operator, in a life before
+        self.unmerged: set[str] = set()  # by the operator, heard or not
         self.twins: list[str] = []  # robots of which two lives speak at once
         self._look_s = -1e18  # nobody's presence changes before
 
@@ -164,7 +163,6 @@ class Roster:
             if len(self.peers) >= self._options.max_peers and not self._make_room():
                 return None
             peer = self.peers[message.robot] = Peer(message.robot, message.boot, now_s, now_s)
-            peer.is_unmerged = message.robot in self.unmerged
             self.joined.append(peer.robot)
             self._look_s = min(self._look_s, self._next_change_s(peer))
         if message.boot != peer.boot:
@@ -189,7 +187,6 @@ class Roster:
                 return None
             lost_s = now_s - self._options.lost_after_s
             peer = self.peers[robot] = Peer(robot, boot, lost_s, lost_s, presence=Presence.LOST)
-            peer.is_unmerged = robot in self.unmerged
         peer.forget_words()
         peer.boot = boot
         return peer

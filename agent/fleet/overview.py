@@ -60,7 +60,7 @@ class Overview:
             now_s - peer.heard_s,
             peer.is_frozen,
             peer.trust.is_quarantined(now_s),
-            peer.is_unmerged,
+            peer.robot in self._ledger.roster.unmerged,
             peer.map,
             peer.known_area_m2,
             beat.load if beat else 0.0,

@@ -29,7 +29,7 @@ class OwnWords:
         self._latest: tuple[OccupancyGrid, FeatureMap, int] | None = None  # not yet published
         self._announced_m2 = 0.0
         self._beat_seq = 0
-        self.epoch = 0  # of the map we published last
+        self.epoch = 0  # of the map we published last, be it in a life before
         self.recalled_epoch: int | None = None  # of the map that remembered transforms are about
         self.T_map_robot: SE2 | None = None
 

@@ -9,6 +9,8 @@ from agent.fleet.estates import Estates
 from agent.fleet.ledger import Ledger
 from agent.fleet.own_words import OwnWords
 from protocol.codec import encode
+from protocol.messages import NO_DIGEST, GlobalTiles
+from protocol.tiles import TileDelta
 
 _DIGEST = re.compile(r"-|[0-9a-f]{32}")
 
@@ -21,7 +23,7 @@ class Registers:
 
     def answer(self, key: str) -> bytes | None:
         """The encoded answer to a query on our subtree, at most 16 KB; None: there is no such register."""
-        own, blobs = self._ledger.own, self._ledger.own.blobs
+        own, answers = self._ledger.own, self._ledger.own.answers
         match key.split("/"):
             case ["hello"]:
                 return encode(self._words.hello())
@@ -29,25 +31,34 @@ class Registers:
                 return encode(own.announcement) if own.announcement else None
             case ["map", "coarse"]:
                 coarse = own.coarse()
-                return blobs.answer(coarse) if coarse else None
+                return answers.to(coarse) if coarse else None
             case ["map", "fine", base, target] if _DIGEST.fullmatch(base) and _DIGEST.fullmatch(target):
                 return own.fine(_digest(base), _digest(target))
             case ["edge", other]:
                 statement = self._ledger.mine.get(other)
                 return encode(statement) if statement else None
             case ["edges"]:
-                return blobs.answer(self._words.statements())
+                return answers.to(self._words.statements())
             case ["global", "meta"]:
-                return blobs.answer(self._composition.meta) if self._composition.meta else None
+                return answers.to(self._composition.meta) if self._composition.meta else None
             case ["global", "tiles", base, target] if _DIGEST.fullmatch(base) and _DIGEST.fullmatch(target):
-                return own.global_tiles(self._composition.history, _digest(base), _digest(target))
+                return self._global_tiles(_digest(base), _digest(target))
             case ["estate", gone, digest] if _DIGEST.fullmatch(digest):
                 estate = self._estates.of(gone, _digest(digest))
-                return blobs.answer(estate) if estate else None
+                return answers.to(estate) if estate else None
             case ["blob", digest, index] if re.fullmatch(r"[0-9a-f]{64}", digest) and re.fullmatch(r"\d{1,5}", index):
-                return blobs.chunk(bytes.fromhex(digest), int(index))
+                return answers.chunk(bytes.fromhex(digest), int(index))
         return None
+
+    def _global_tiles(self, base: bytes, target: bytes) -> bytes | None:
+        """The difference between two global maps we hold; from nothing when the base is not remembered."""
+        ledger, history = self._ledger, self._composition.history
+        wanted, old = history.get(target) if target else history.newest, history.get(base)
+        if wanted is None:
+            return None
+        name = ("global", old.digest if old else NO_DIGEST, wanted.digest)
+        return ledger.own.answers.kept(name, lambda: GlobalTiles(ledger.robot, ledger.boot, TileDelta.between(old, wanted)))
 
 
 def _digest(text: str) -> bytes:
-    return b"" if text == "-" else bytes.fromhex(text)
+    return NO_DIGEST if text == "-" else bytes.fromhex(text)

@@ -19,8 +19,7 @@ import cv2
 import numpy as np
 
 from agent.features.snapshot import MapSnapshot
-from agent.fleet.consistency import coarsened
-from agent.fleet.own_map import COARSE_M, OwnMap
+from agent.fleet.own_map import COARSE_M, OwnMap, coarsened
 from hw.carmen import read_recording
 from protocol.codec import encode
 from protocol.features import FeatureMap

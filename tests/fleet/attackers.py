@@ -36,7 +36,6 @@ class Attack:
     """Base: `begin` is called once the fleet has merged, `every_second` after that."""
 
     is_detectable = True  # somebody honest can prove that it lies
-    starts_merged = True
 
     def begin(self, fleet: Fleet, node: Node) -> None:
         """Turn bad."""

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 import random
 from dataclasses import replace
 
 import pytest
 
+from agent.fleet.coordinator import Coordinator
 from agent.fleet.effects import Match, MatchKind
 from agent.fleet.memory import FleetMemory, decode_memory
 from agent.merging.result import MatchStatus, MergeResult
 from protocol.geometry import SE2
+from protocol.messages import Beat
 from tests.fleet.explorer import Explorer, random_world
 from tests.fleet.simulation import Fleet, Node, truthful
 
@@ -108,6 +111,23 @@ def test_whom_the_operator_took_out_stays_out() -> None:
     fleet.run(15.0)
     assert node.global_map is None
     assert {peer.robot for peer in node.coordinator.state(fleet.now_s).peers if peer.is_unmerged} == {"r1", "r2"}
+
+
+def test_whom_the_operator_took_out_stays_out_over_lives_in_which_it_is_not_heard() -> None:
+    lives = [Coordinator("r0", boot) for boot in (1, 2, 3)]
+    lives[0].on_message(Beat("r9", 1, 1, 1.0, 1.0, None, b"", b""), 0.0)
+    lives[0].unmerge("r9", 0.0)
+    for earlier, later in itertools.pairwise(lives):
+        later.recall(earlier.memory())
+    assert lives[2].memory().unmerged == ("r9",)
+    lives[2].readmit("r9", 0.0)
+    assert lives[2].memory().unmerged == ()
+
+
+def test_a_life_that_draws_no_map_keeps_what_is_remembered_and_of_which_map_it_is() -> None:
+    coordinator = Coordinator("r0", 1)
+    coordinator.recall(MEMORY)
+    assert coordinator.memory() == MEMORY
 
 
 def test_memory_reads_as_written_and_anything_else_is_nothing() -> None:
