@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
+from agent.runtime.pending import NO_SUCH_REGISTER
 from agent.runtime.traffic import MAX_PAYLOAD_BYTES, Traffic
 
 log = logging.getLogger(__name__)
@@ -59,7 +60,11 @@ class Answering:
 
     def _reply(self, query: Any) -> None:
         key = str(query.key_expr)
-        content = None if "*" in key else self._answer(key)
-        if content is not None and len(content) <= MAX_PAYLOAD_BYTES:
-            query.reply(key, content)  # as droppable as the query it answers
-            self._traffic.served_bytes += len(content)
+        if "*" in key:
+            return
+        content = self._answer(key)
+        if content is None or len(content) > MAX_PAYLOAD_BYTES:
+            query.reply_err(NO_SUCH_REGISTER)
+            return
+        query.reply(key, content)  # as droppable as the query it answers
+        self._traffic.served_bytes += len(content)

@@ -178,7 +178,7 @@ class Exchange:
         return True
 
     def receive(self, pending: Pending | None) -> bytes | None:
-        """Wait for an answer; None when none came."""
+        """Wait for an answer; None when none came.  NoSuchRegister: who was asked has none."""
         started_s, again_s = time.monotonic(), max(ASK_AGAIN_S, SLOW_FACTOR * self._answer_took_s)
         content = None if pending is None else pending.wait(QUERY_TIMEOUT_S + 1.0, again_s, self.closed)
         if content is None:

@@ -11,6 +11,7 @@ import threading
 from typing import Generic, Protocol, TypeVar
 
 from agent.runtime.guard import Guard
+from agent.runtime.pending import NoSuchRegister
 from protocol.channels import chunk_register, robot_key
 from protocol.codec import decode
 from protocol.errors import RemoteProtocolError
@@ -28,7 +29,8 @@ class Asker(Protocol[P]):
 
     def ask(self, key: str, priority: str = "DATA") -> P: ...
 
-    def receive(self, pending: P) -> bytes | None: ...
+    def receive(self, pending: P) -> bytes | None:
+        """None: no answer came.  NoSuchRegister: there is none."""
 
 
 class Pull(Generic[P]):
@@ -41,18 +43,25 @@ class Pull(Generic[P]):
 
     def run(self, register: str, *, is_bulk: bool) -> Message | None:
         """The message in that register; None when it did not come, or when what came is not what was promised."""
-        while (message := self._fetch(register, "BACKGROUND" if is_bulk else "DATA")) is not None:
-            if not isinstance(message, Manifest):
-                return message
-            whole = self._pieces(message)
-            if whole is not None:
-                try:
+        try:
+            while (message := self._fetch(register, "BACKGROUND" if is_bulk else "DATA")) is not None:
+                if not isinstance(message, Manifest):
+                    return message
+                whole = self._whole(message)
+                if whole is not None:
                     return decode(whole)
-                except RemoteProtocolError:
+                if not self._may_retry():
                     return None
-            if not self._may_retry():
-                return None
+        except (NoSuchRegister, RemoteProtocolError):
+            pass
         return None
+
+    def _whole(self, manifest: Manifest) -> bytes | None:
+        """What the pieces make; None when one gave way to newer answers meanwhile, or is not what was promised."""
+        try:
+            return self._pieces(manifest)
+        except NoSuchRegister:
+            return None
 
     def _pieces(self, manifest: Manifest) -> bytes | None:
         """All pieces joined, when their hash is the promised one."""

@@ -17,6 +17,7 @@ from agent.runtime import announcer as announcer_module
 from agent.runtime import exchange as exchange_module
 from agent.runtime.exchange import Exchange, ExchangeError
 from agent.runtime.network import NetworkSettings
+from agent.runtime.pending import NoSuchRegister
 from agent.runtime.traffic import MAX_PAYLOAD_BYTES
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -42,6 +43,13 @@ def hub() -> Iterator[Exchange]:
 
 def dial(hub: Exchange, robot: str = "leaf", subscribe: tuple[str, ...] = ()) -> Exchange:
     return Exchange(NetworkSettings(robot, connect=tuple(hub.locators())), nothing, subscribe=subscribe)
+
+
+def answer(asker: Exchange, key: str) -> bytes | None:
+    try:
+        return asker.receive(asker.ask(key))
+    except NoSuchRegister:
+        return None
 
 
 def test_an_ephemeral_port_is_known_and_dialled(hub: Exchange) -> None:
@@ -70,7 +78,9 @@ def test_a_question_that_stays_silent_is_asked_once_more() -> None:
 
     def answer(key: str) -> bytes | None:
         heard.append(key)
-        return key.encode() if len(heard) > 1 else None
+        if len(heard) == 1:
+            raise RuntimeError("deaf")
+        return key.encode()
 
     with Exchange(NetworkSettings("deaf"), answer, serve="t/deaf/**") as deaf, dial(deaf) as leaf:
         until(leaf.links)
@@ -116,7 +126,29 @@ def test_too_large_an_answer_is_not_sent() -> None:
         dial(hub) as leaf,
     ):
         until(leaf.links)
-        assert leaf.receive(leaf.ask("t/hub/x")) is None
+        with pytest.raises(NoSuchRegister):
+            leaf.receive(leaf.ask("t/hub/x"))
+
+
+def test_a_register_that_is_not_there_is_told_from_an_answer_that_is_lost() -> None:
+    with Exchange(NetworkSettings("hub"), nothing, serve="t/hub/**") as hub, dial(hub) as leaf:
+        until(leaf.links)
+        started = time.monotonic()
+        with pytest.raises(NoSuchRegister):
+            leaf.receive(leaf.ask("t/hub/map/gone"))
+        assert time.monotonic() - started < 3.0 and leaf.traffic.unanswered == 0
+
+
+def test_what_one_denies_another_may_have() -> None:
+    """Two lives of one robot serve the same registers for a while."""
+    with (
+        Exchange(NetworkSettings("hub"), nothing, serve="t/hub/**") as hub,
+        Exchange(NetworkSettings("twin"), lambda key: b"here", serve="t/hub/**") as twin,
+        Exchange(NetworkSettings("leaf", connect=(*hub.locators(), *twin.locators())), nothing) as leaf,
+    ):
+        until(lambda: len(leaf.links()) == 2)
+        until(lambda: answer(leaf, "t/hub/x") == b"here")
+        assert [answer(leaf, "t/hub/x") for _ in range(20)] == [b"here"] * 20
 
 
 def test_a_bug_in_answering_costs_one_answer() -> None:

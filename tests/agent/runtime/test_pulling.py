@@ -11,6 +11,7 @@ import pytest
 
 from agent.runtime import pulling
 from agent.runtime.guard import OpenGuard
+from agent.runtime.pending import NoSuchRegister
 from agent.runtime.pulling import CHUNKS_IN_FLIGHT, MAX_RETRIES, Pull
 from protocol.channels import CHUNK_BYTES, chunk_register, robot_key
 from protocol.codec import encode
@@ -27,6 +28,7 @@ class Shelf:
     def __init__(self) -> None:
         self.content: dict[str, bytes] = {}
         self.silent: dict[str, int] = {}
+        self.denied: set[str] = set()
         self.asked: list[str] = []
         self.in_flight = self.most_in_flight = 0
 
@@ -41,6 +43,8 @@ class Shelf:
 
     def receive(self, pending: str) -> bytes | None:
         self.in_flight -= 1
+        if pending in self.denied:
+            raise NoSuchRegister
         if self.silent.get(pending, 0) > 0:
             self.silent[pending] -= 1
             return None
@@ -100,6 +104,19 @@ def test_a_piece_that_did_not_come_is_asked_for_again(shelf: Shelf) -> None:
 def test_nobody_there_is_given_up_after_a_few_tries(shelf: Shelf) -> None:
     assert pull(shelf) is None
     assert len(shelf.asked) == 1 + MAX_RETRIES
+
+
+def test_a_register_that_is_not_there_is_asked_for_once(shelf: Shelf) -> None:
+    shelf.denied = {robot_key(FLEET, PEER, KEY)}
+    assert pull(shelf) is None
+    assert len(shelf.asked) == 1
+
+
+def test_pieces_that_gave_way_to_newer_answers_are_cut_anew(shelf: Shelf) -> None:
+    keys = shelve_in_pieces(shelf, coarse(700))
+    shelf.denied = {keys[2]}
+    assert pull(shelf) is None
+    assert shelf.asked.count(robot_key(FLEET, PEER, KEY)) == 1 + MAX_RETRIES
 
 
 def test_a_lie_about_the_whole_is_found_and_given_up(shelf: Shelf) -> None:
