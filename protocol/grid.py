@@ -72,6 +72,8 @@ class OccupancyGrid:
         rows, cols = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
         if rows.size == 0:
             return replace(OccupancyGrid.empty(self.resolution_m), origin=self.origin)
+        if margin_cells == 0 and (rows[0], cols[0], rows[-1] + 1, cols[-1] + 1) == (0, 0, *self.cells.shape):
+            return self
         part = self.cells[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
         cells = np.pad(part, margin_cells, constant_values=UNKNOWN)
         corner = SE2((cols[0] - margin_cells) * self.resolution_m, (rows[0] - margin_cells) * self.resolution_m, 0.0)

@@ -21,6 +21,7 @@ _MAX_SAMPLES = 6  # per axis and cell when shrinking: beyond a factor of six a d
 _BITS = 32  # of a cell: 32,000 cells further the error is a hundred-thousandth of a cell
 _SIDE = 32_766  # beyond every source image that cv2 takes
 _UNKNOWN_BYTE = UNKNOWN & 0xFF
+_BAND_ROWS = 64  # sampled at a time: the indices of a whole map take thirty times its own memory
 _NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))  # each touching pair of cells once, (row, col)
 
 
@@ -128,15 +129,22 @@ def _area_vote(source: OccupancyGrid, T_target_grid: SE2, lattice: Lattice) -> t
     )
     free = np.zeros((lattice.height, lattice.width), np.uint8)
     occupied = np.zeros_like(free)
-    for i in range(n * n):
-        half_cols = 2 * (n * np.arange(lattice.width) + i % n) + 1
-        half_rows = 2 * (n * np.arange(lattice.height) + i // n) + 1
-        row, col = motion.at(half_cols[None, :], half_rows[:, None])
-        there = cv2.merge([np.clip(at, -1, _SIDE).astype(np.int16) for at in (col, row)])  # np.stack takes nine times as long
-        seen = cv2.remap(image, there, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=_UNKNOWN_BYTE)
-        free += seen == FREE
-        occupied += seen == OCCUPIED
+    for first in range(0, lattice.height, _BAND_ROWS):
+        band = slice(first, min(first + _BAND_ROWS, lattice.height))
+        for i in range(n * n):
+            half_cols = 2 * (n * np.arange(lattice.width) + i % n) + 1
+            half_rows = 2 * (n * np.arange(band.start, band.stop) + i // n) + 1
+            seen = _seen(image, *motion.at(half_cols[None, :], half_rows[:, None]))
+            free[band] += seen == FREE
+            occupied[band] += seen == OCCUPIED
     return 2 * free.astype(np.int16) >= n * n, occupied > 0
+
+
+def _seen(image: NDArray[np.uint8], row: NDArray[np.int64], col: NDArray[np.int64]) -> NDArray[np.uint8]:
+    """Values under (row, col), unknown outside."""
+    there = cv2.merge([np.clip(at, -1, _SIDE).astype(np.int16) for at in (col, row)])  # np.stack takes nine times as long
+    seen = cv2.remap(image, there, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=_UNKNOWN_BYTE)
+    return np.asarray(seen, np.uint8)
 
 
 def _carried_walls(source: OccupancyGrid, T_target_grid: SE2, lattice: Lattice) -> NDArray[np.bool_]:

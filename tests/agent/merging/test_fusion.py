@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 
 import cv2
 import numpy as np
@@ -146,6 +147,18 @@ def test_what_only_one_map_knows_is_kept():
 def test_three_hundred_maps_are_no_trouble():
     maps = [(room(0.1), SE2(0.0003 * i, 0.0, 0.0)) for i in range(300)]
     assert fuse(maps).consistency > 0.9
+
+
+def test_fusing_many_maps_takes_little_more_room_than_the_one_they_make():
+    maps = [(room(0.02).cropped(), SE2(0.1 * k, 0.0, 0.3)) for k in range(12)]
+    fuse(maps)
+    tracemalloc.start()
+    try:
+        fused = fuse(maps)
+        peak_bytes = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak_bytes < 25 * fused.grid.cells.size
 
 
 @pytest.mark.parametrize("cells", [np.full((0, 0), UNKNOWN, np.int8), np.full((5, 7), UNKNOWN, np.int8)])
