@@ -11,8 +11,8 @@ from __future__ import annotations
 from agent.fleet.broken_word import TakenBack, grown, share_found_again, taken_back, witnessed
 from agent.fleet.consistency import agreement
 from agent.fleet.ledger import Ledger, pair_key
-from agent.fleet.members import Peer
 from agent.fleet.pairs import PairWork
+from agent.fleet.peer import Peer
 from protocol.geometry import SE2
 from protocol.grid import OccupancyGrid
 from protocol.messages import Stance

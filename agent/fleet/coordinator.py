@@ -22,12 +22,12 @@ from agent.fleet.fetching import Fetching
 from agent.fleet.inbox import Inbox
 from agent.fleet.ledger import Ledger
 from agent.fleet.letting_go import LettingGo
-from agent.fleet.members import Peer
 from agent.fleet.memory import FleetMemory
 from agent.fleet.options import FleetOptions
 from agent.fleet.overview import Overview
 from agent.fleet.own_words import OwnWords
 from agent.fleet.pairs import PairWork
+from agent.fleet.peer import Peer
 from agent.fleet.pulling import Pulling
 from agent.fleet.registers import Registers
 from agent.fleet.state import FleetState

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from agent.fleet.ledger import Ledger
-from agent.fleet.members import Peer, Told
+from agent.fleet.peer import Peer, Told
 from agent.fleet.recipe import tiles_of
 from agent.fleet.state import Presence
 from protocol.messages import NO_DIGEST, Estate, GlobalMember, GlobalMeta
@@ -67,7 +67,7 @@ class Estates:
             return
         by = frozenset({said.robot}) | (told.by if told is not None and is_more else frozenset())
         peer.told = Told(said.map, said.is_frozen, witnesses, by, {member.robot: member.T_global_map for member in meta.members})
-        peer.maps.add(tiles)
+        peer.add_map(said.map, tiles)
         peer.hold(said.map, tiles.grid())
         for statement in said.statements:
             if statement.other not in words or statement.seq > words[statement.other].seq:
@@ -79,10 +79,8 @@ class Estates:
     def _take_cells(self, peer: Peer, said: Estate) -> None:
         """One more version of a map that is joined to ours; whether it may enter the global map is asked as of any other."""
         tiles = said.delta.apply(None)
-        peer.maps.add(tiles, needed=peer.admitted.digest if peer.admitted is not None else NO_DIGEST)
-        if peer.holds(said.map):
-            peer.versions[said.map.digest] = said.map
-        else:
+        peer.add_map(said.map, tiles)
+        if not peer.holds(said.map):
             peer.hold(said.map, tiles.grid())
 
     def _other_versions(self, now_s: float) -> Iterator[tuple[str, GlobalMember]]:

@@ -7,8 +7,8 @@ from agent.fleet.consistency import is_same_drawing
 from agent.fleet.estates import Estates
 from agent.fleet.fetching import Fetching
 from agent.fleet.ledger import Ledger
-from agent.fleet.members import Peer, newer_statements, still_beats
 from agent.fleet.pairs import PairWork
+from agent.fleet.peer import Peer
 from agent.fleet.state import Presence
 from protocol.errors import RemoteProtocolError
 from protocol.messages import (
@@ -76,9 +76,10 @@ class Inbox:
                 self._on_estate(peer, message, now_s)
             case _:
                 pass
+        self._settle_lives(now_s)
 
     def _on_beat(self, peer: Peer, beat: Beat, now_s: float) -> None:
-        before, is_back = peer.map, not still_beats(peer, now_s)
+        before, is_back = peer.map, not peer.still_beats(now_s)
         if not self._ledger.roster.accept_beat(peer, beat, now_s):
             return
         if peer.presence is not Presence.ALIVE:
@@ -111,7 +112,7 @@ class Inbox:
         self._after_statements(peer, [said], now_s)
 
     def _on_statements(self, peer: Peer, said: Statements, now_s: float) -> None:
-        self._after_statements(peer, newer_statements(peer, said), now_s)
+        self._after_statements(peer, peer.take_statements(said), now_s)
 
     def _after_statements(self, peer: Peer, changed: list[Statement], now_s: float) -> None:
         """Judge every edge again of which the peer spoke anew."""
@@ -134,7 +135,7 @@ class Inbox:
             self._ledger.note("forged-map", is_warning=True, peer=peer.robot, reason=str(error))
             self._pairs.words.strike(peer, "forged map", now_s)
             return
-        peer.maps.add(tiles, needed=peer.admitted.digest if peer.admitted is not None else b"")
+        peer.add_map(said.map, tiles)
         if peer.held is not None and peer.held.frame != said.map.frame:
             peer.anchor, peer.judged = None, ()
             if peer.grid is not None and not is_same_drawing(peer.grid, tiles.grid()):
@@ -142,8 +143,6 @@ class Inbox:
         is_newest = peer.held is None or peer.held.frame != said.map.frame or said.map.revision > peer.held.revision
         if is_newest:
             peer.hold(said.map, tiles.grid())
-        else:
-            peer.versions[said.map.digest] = said.map
 
     def _on_global_tiles(self, peer: Peer, said: GlobalTiles, now_s: float) -> None:
         try:
@@ -163,7 +162,7 @@ class Inbox:
             self._pairs.on_new_frame(peer.robot, now_s)
 
     def _settle_lives(self, now_s: float) -> None:
-        """Robots that joined, began a new life, or run twice."""
+        """Robots that joined, began a new life, gave way to others, or run twice."""
         roster = self._ledger.roster
         for robot in roster.joined:
             self._ledger.note("peer-joined", peer=robot)
@@ -176,7 +175,11 @@ class Inbox:
             for other in self._ledger.peers:
                 self._ledger.judge_pair(robot, other, now_s)
             self._ledger.judge_pair(robot, self._ledger.robot, now_s)
+        for robot in roster.forgotten:
+            self._pairs.words.forget(robot)
+            self._fetching.begin_anew(robot)
+            self._ledger.judge_all(robot, now_s)
         for robot in roster.twins:
             if self._ledger.count(f"twins of {robot}") == 1:
                 self._ledger.note("twin", is_warning=True, peer=robot)
-        roster.joined, roster.restarted, roster.twins = [], [], []
+        roster.joined, roster.restarted, roster.forgotten, roster.twins = [], [], [], []

@@ -7,9 +7,10 @@ from collections.abc import Iterable
 
 from agent.fleet.effects import Effect, Note, Send
 from agent.fleet.frame_graph import Edge, Group, Layout, connected, solve
-from agent.fleet.members import Peer, Roster
 from agent.fleet.options import FleetOptions
 from agent.fleet.own_map import OwnMap
+from agent.fleet.peer import Peer
+from agent.fleet.roster import Roster
 from agent.fleet.timetable import Clock, Timetable
 from protocol.geometry import SE2, wrap_angle
 from protocol.messages import NO_DIGEST, Evidence, Message, Stance, Statement
@@ -22,7 +23,7 @@ def pair_key(a: str, b: str) -> PairKey:
 
 
 class Ledger:
-    """The shared memory of `Coordinator`, `PairWork`, `Composition` and `Fetching`."""
+    """The shared memory of all parts of a `Coordinator`."""
 
     def __init__(self, robot: str, boot: int, options: FleetOptions) -> None:
         self.robot, self.boot, self.options = robot, boot, options

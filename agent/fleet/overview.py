@@ -7,8 +7,8 @@ from dataclasses import replace
 
 from agent.fleet.composition import Composition
 from agent.fleet.ledger import Ledger, pair_key
-from agent.fleet.members import Peer
 from agent.fleet.pairs import PairWork
+from agent.fleet.peer import Peer
 from agent.fleet.state import FleetState, FrameState, PeerState
 from protocol.geometry import SE2
 from protocol.messages import Evidence

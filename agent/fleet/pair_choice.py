@@ -11,9 +11,9 @@ import heapq
 import numpy as np
 
 from agent.fleet.ledger import Ledger, pair_key, supported
-from agent.fleet.members import Peer
 from agent.fleet.pair import Attempt, Due, Pair, Purpose
 from agent.fleet.pair_words import PairWords
+from agent.fleet.peer import Peer
 from agent.fleet.state import Presence
 from protocol.features import LINE_COLUMNS, FeatureMap
 from protocol.messages import Evidence, MapVersion, Stance, Statement

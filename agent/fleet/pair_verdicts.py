@@ -5,9 +5,9 @@ from __future__ import annotations
 from agent.fleet.consistency import agreement
 from agent.fleet.evidence import evidence_of
 from agent.fleet.ledger import Ledger, pair_key
-from agent.fleet.members import Peer
 from agent.fleet.pair import Attempt, Pair, Purpose, Running
 from agent.fleet.pair_words import PairWords
+from agent.fleet.peer import Peer
 from agent.merging.result import MatchStatus, MergeResult
 from protocol.geometry import wrap_angle
 from protocol.messages import NO_DIGEST, Evidence, Stance

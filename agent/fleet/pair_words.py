@@ -7,8 +7,8 @@ always safe: a withdrawal needs nobody's consent.
 from __future__ import annotations
 
 from agent.fleet.ledger import Ledger, supported
-from agent.fleet.members import Peer
 from agent.fleet.pair import Attempt, Pair
+from agent.fleet.peer import Peer
 from protocol.geometry import SE2
 from protocol.messages import NO_DIGEST, Evidence, Stance, Statement
 
@@ -98,6 +98,12 @@ class PairWords:
             if mine.stance in (Stance.PROPOSE, Stance.ACK):
                 pair.hint = self._ledger.from_our_side(mine.evidence)
             del self._ledger.mine[other]
+            self._ledger.seq += 1
+
+    def forget(self, robot: str) -> None:
+        """A robot that gave way to others: we say nothing of it any more, and compare it anew when it comes back."""
+        self.pairs.pop(robot, None)
+        if self._ledger.mine.pop(robot, None) is not None:
             self._ledger.seq += 1
 
     def strike(self, peer: Peer, reason: str, now_s: float) -> None:

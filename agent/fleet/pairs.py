@@ -15,11 +15,11 @@ from __future__ import annotations
 from agent.fleet.effects import Match, MatchKind
 from agent.fleet.evidence import facts_of
 from agent.fleet.ledger import Ledger
-from agent.fleet.members import Peer
 from agent.fleet.pair import Due, Pair, Purpose, Running
 from agent.fleet.pair_choice import PairChoice
 from agent.fleet.pair_verdicts import PairVerdicts
 from agent.fleet.pair_words import PairWords
+from agent.fleet.peer import Peer
 from agent.merging.result import MergeResult
 
 

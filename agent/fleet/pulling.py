@@ -6,8 +6,8 @@ from agent.fleet.composition import Composition
 from agent.fleet.estates import Estates
 from agent.fleet.fetching import Fetching
 from agent.fleet.ledger import Ledger, statements_digest
-from agent.fleet.members import Peer
 from agent.fleet.pairs import PairWork
+from agent.fleet.peer import Peer
 from agent.fleet.state import Presence
 from protocol.channels import estate_register, fine_register, global_register
 from protocol.messages import NO_DIGEST

@@ -183,7 +183,8 @@ class Schedule:
                 assert TileMap.of(own.grid, own.tiles).digest == own.tiles.digest, f"I2: {node.name}'s own map was altered"
             assert len(ledger.peers) <= robots, f"I5: {node.name} knows {len(ledger.peers)} peers of {robots}"
             for peer in ledger.peers.values():
-                assert len(peer.maps.digests()) <= 6 and len(peer.statements) <= robots and len(peer.ghosts) <= 4, "I5"
+                assert len(peer.versions) <= len(peer.maps.digests()) <= 6, "I5: maps"
+                assert len(peer.statements) <= robots and len(peer.ghosts) <= 4, "I5: words"
             for evidence in ledger.live.values():
                 both = ledger.statement(evidence.robot_a, evidence.robot_b), ledger.statement(evidence.robot_b, evidence.robot_a)
                 assert agreed(*both) is not None, "I3: an edge without two statements"

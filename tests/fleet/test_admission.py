@@ -10,7 +10,8 @@ import pytest
 
 from agent.fleet.admission import Admission
 from agent.fleet.ledger import Ledger, pair_key
-from agent.fleet.members import Peer
+from agent.fleet.own_map import _KEPT_VERSIONS
+from agent.fleet.peer import Peer
 from protocol.features import FeatureMap
 from protocol.geometry import SE2
 from protocol.grid import FREE, OCCUPIED, OccupancyGrid
@@ -117,9 +118,9 @@ def test_the_version_a_recipe_uses_can_be_pulled_however_long_ago_it_was(is_used
     used = own.pinned
     assert used == own.version.digest
     own.pinned = used if is_used else b""
-    for i in range(20):
+    for i in np.argwhere(own.grid.cells.ravel() != OCCUPIED)[: _KEPT_VERSIONS + 1, 0]:
         cells = own.grid.cells.copy()
-        cells[0, i] = OCCUPIED
+        cells.flat[i] = OCCUPIED
         assert own.publish(replace(own.grid, cells=cells), FeatureMap(), own.version.frame)
     assert (own.fine(b"", used) is not None) == is_used
 

@@ -10,13 +10,16 @@ import pytest
 
 from agent.fleet.coordinator import Coordinator
 from agent.fleet.effects import Fetch, Fuse, Match, MatchKind, Send
-from agent.fleet.members import Roster
 from agent.fleet.options import FleetOptions
+from agent.fleet.peer import Peer
+from agent.fleet.roster import Roster
 from agent.merging.result import MatchFactor, MatchStatus, MergeResult
 from protocol.codec import decode, encode
 from protocol.features import FeatureMap
 from protocol.geometry import SE2
+from protocol.grid import FREE, OccupancyGrid
 from protocol.messages import Beat, FineTiles, MapAnnouncement, MapVersion, Message, Stance, Statement
+from protocol.tiles import TileMap
 from tests.fleet.explorer import Explorer, random_world
 from tests.fleet.groups import PLACES, WORLD, edges, events, fleet_of, names
 from tests.fleet.simulation import Fleet, Node, truthful
@@ -220,6 +223,14 @@ def test_statements_about_robots_that_nobody_knows_stay_bounded() -> None:
     assert coordinator.counts["statements about too many"] == 180
 
 
+def test_however_many_old_versions_a_peer_hands_out_few_are_kept() -> None:
+    peer = Peer("x", 1, 0.0, 0.0)
+    for revision in range(100):
+        tiles = TileMap.of(OccupancyGrid(np.full((8, 8 + revision), FREE, np.int8), 0.05))
+        peer.add_map(MapVersion(1, revision, tiles.digest), tiles)
+    assert len(peer.versions) == len(peer.maps.digests()) < 10
+
+
 def test_a_full_table_forgets_lost_strangers_before_lost_members() -> None:
     roster = Roster(FleetOptions(max_peers=2))
     for robot in ("member", "stranger"):
@@ -248,3 +259,21 @@ def test_in_a_fleet_larger_than_one_turn_the_most_alike_is_looked_at_first() -> 
                 asked.append(effect.peer)
                 coordinator.on_fetched(effect, None, 0.2 * t)
     assert "x150" in asked
+
+
+def test_a_member_that_gives_way_to_strangers_is_out_of_everything() -> None:
+    fleet = fleet_of(3, options=FleetOptions(max_peers=4))
+    fleet.run_until(lambda: fleet.agrees(names(3)), 20.0)
+    node = fleet.nodes["r1"]
+    coordinator = node.coordinator
+    assert coordinator is not None
+    fleet.crash(fleet.nodes["r2"])
+    for second in range(60):
+        for i in range(4):
+            beat = Beat(f"x{i}", 1, second + 1, float(second), 1.0, None, b"", b"")
+            fleet.carry_out(node, coordinator.on_message(beat, fleet.now_s))
+        fleet.run(1.0)
+    assert "r2" not in {peer.robot for peer in coordinator.state(fleet.now_s).peers}
+    assert edges(node) == {("r0", "r1")}
+    assert set(coordinator._pairs.pairs) == set(coordinator._ledger.peers)
+    assert "r2" not in coordinator._ledger.mine

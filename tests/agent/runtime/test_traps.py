@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agent.fleet.members import Roster
 from agent.fleet.options import FleetOptions
+from agent.fleet.roster import Roster
 from agent.fleet.state import Presence
 from agent.runtime.exchange import Exchange
 from agent.runtime.guard import OpenGuard
