@@ -123,6 +123,8 @@ def running(node: Node) -> Any:
         raise CommandError(str(error), PEER) from error
     except ControlError as error:
         raise CommandError(str(error), ENVIRONMENT) from error
+    except NetworkConfigError as error:
+        raise CommandError(str(error), USAGE) from error
     except DeviceConfigError as error:
         raise CommandError(str(error), BAD_INPUT) from error
     try:

@@ -44,6 +44,7 @@ class NetworkSettings:
     allow_open: bool = False  # `open` beyond loopback, said on purpose
     key_file: Path | None = None  # `shared`: the fleet's secret
     certificates: Path | None = None  # `mtls`: directory with ca.pem, <robot>.pem, <robot>.key, acl.json
+    holder: str = ""  # `mtls`: whose certificate it is; empty: the robot's own
     is_router: bool = False
 
     def checked(self) -> NetworkSettings:
@@ -150,11 +151,11 @@ def multicast(settings: NetworkSettings) -> dict[str, Any]:
 def add_certificates(config: dict[str, Any], settings: NetworkSettings) -> None:
     """TLS in both directions, and the access rules: who may write where is decided by the certificate's name."""
     assert settings.certificates is not None
-    folder = settings.certificates
-    files = {"ca": folder / "ca.pem", "certificate": folder / f"{settings.robot}.pem", "key": folder / f"{settings.robot}.key"}
+    folder, holder = settings.certificates, settings.holder or settings.robot
+    files = {"ca": folder / "ca.pem", "certificate": folder / f"{holder}.pem", "key": folder / f"{holder}.key"}
     for what, path in files.items():
         if not path.is_file():
-            raise NetworkConfigError(f"{path}: the {what} file is missing; run mapquilt fleet enroll {settings.robot}")
+            raise NetworkConfigError(f"{path}: the {what} file is missing; run mapquilt fleet enroll {holder}")
     config["transport"]["link"]["protocols"] = ["tls"]
     config["transport"]["link"]["tls"] = {
         "root_ca_certificate": str(files["ca"]),
@@ -168,8 +169,10 @@ def add_certificates(config: dict[str, Any], settings: NetworkSettings) -> None:
     }
     acl = folder / "acl.json"
     if not acl.is_file():
-        raise NetworkConfigError(f"{acl}: the access rules are missing; run mapquilt fleet enroll {settings.robot}")
+        raise NetworkConfigError(f"{acl}: the access rules are missing; run mapquilt fleet enroll {holder}")
     try:
         config["access_control"] = json.loads(acl.read_text())
+    except OSError as error:
+        raise NetworkConfigError(f"{acl}: cannot be read ({error.strerror}); let the robot's user read it") from error
     except ValueError as error:
-        raise NetworkConfigError(f"{acl}: not valid JSON ({error}); run mapquilt fleet enroll {settings.robot} again") from error
+        raise NetworkConfigError(f"{acl}: not valid JSON ({error}); run mapquilt fleet enroll {holder} again") from error

@@ -42,9 +42,10 @@ class FrozenPeer:
         self.name = settings.robot[: MAX_NAME_CHARS - len(suffix)] + suffix
         self.path = path
         self._grid = load_map(path)
-        self._settings = replace(settings, robot=self.name, listen=(), is_router=False)
-        coordinator = Coordinator(self.name, secrets.randbits(63), replace(options, is_frozen=True))
-        self._fleet = FleetWorker(coordinator, self._settings, merger, guard_for(settings, secrets.randbits(63)))
+        self._settings = replace(settings, robot=self.name, holder=settings.robot, listen=(), is_router=False)
+        boot_id = secrets.randbits(63)
+        coordinator = Coordinator(self.name, boot_id, replace(options, is_frozen=True))
+        self._fleet = FleetWorker(coordinator, self._settings, merger, guard_for(self._settings, boot_id))
 
     def workers(self) -> list[Worker]:
         """Rows for the node's table."""

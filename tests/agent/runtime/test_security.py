@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import contextlib
 import stat
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from agent.cli import main
+from agent.fleet.options import FleetOptions
+from agent.map_files import save_map
+from agent.merging.result import MatchOptions
 from agent.runtime.exchange import Exchange
 from agent.runtime.guard import SharedGuard, guard_for
+from agent.runtime.merge_worker import MergeWorker
 from agent.runtime.network import NetworkConfigError, NetworkSettings
+from agent.runtime.priors import FrozenPeer
 from protocol.channels import robot_key, subscriptions
+from protocol.codec import decode
 from protocol.errors import RemoteProtocolError
+from protocol.grid import OccupancyGrid
 from tests.agent.runtime.test_exchange import nothing, until
 
 FLEET = "secure"
@@ -87,6 +96,20 @@ def shared(keys: Path, robot: str) -> NetworkSettings:
 def test_the_fleets_secret_opens_what_its_members_say(keys: Path) -> None:
     a, b = guard_for(shared(keys, "a"), 1), guard_for(shared(keys, "b"), 2)
     assert b.open(a.seal(b"words"), "a") == b"words"
+
+
+@pytest.mark.parametrize("level", ["shared", "mtls"])
+def test_a_given_map_speaks_in_its_own_name_with_its_robots_keys(keys: Path, level: str, tmp_path: Path) -> None:
+    settings = {"shared": shared, "mtls": mtls}[level]
+    save_map(OccupancyGrid(np.zeros((20, 20), np.int8), 0.05), tmp_path / "office")
+    prior = FrozenPeer(tmp_path / "office.yaml", 1, settings(keys, "b"), MergeWorker(MatchOptions()), FleetOptions())
+    beat, words = robot_key(FLEET, "b-prior1", "beat"), []
+    with open_exchange(settings(keys, "a")) as a, contextlib.closing(prior):
+        prior.open(tuple(a.locators()))
+        step = prior.workers()[0].step
+        until(lambda: step() or words.append(a.inbox.take()) or any(word and word[0] == beat for word in words), 15.0)
+    sealed = next(word[1] for word in words if word and word[0] == beat)
+    assert decode(guard_for(settings(keys, "a"), 1).open(sealed, "b-prior1")).robot == "b-prior1"
 
 
 def test_unsealed_foreign_replayed_and_misnamed_words_are_refused(keys: Path) -> None:
