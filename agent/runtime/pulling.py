@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import threading
+import time
+from collections.abc import Callable
 from typing import Generic, Protocol, TypeVar
 
 from agent.runtime.guard import Guard
@@ -20,6 +22,7 @@ from protocol.messages import Chunk, Manifest, Message
 CHUNKS_IN_FLIGHT = 2
 MAX_RETRIES = 6  # of one pull, over all its pieces
 RETRY_PAUSE_S = 0.1  # grows with every retry
+LONGEST_PULL_S = 40.0  # the coordinator waits no longer (`fetch_timeout_s`), and after 60 s a puller counts as stuck
 
 P = TypeVar("P")
 
@@ -36,9 +39,18 @@ class Asker(Protocol[P]):
 class Pull(Generic[P]):
     """One transfer.  `run` waits, so it belongs on a worker's thread."""
 
-    def __init__(self, asker: Asker[P], guard: Guard, fleet: str, peer: str, closed: threading.Event) -> None:
+    def __init__(
+        self,
+        asker: Asker[P],
+        guard: Guard,
+        fleet: str,
+        peer: str,
+        closed: threading.Event,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._asker, self._guard = asker, guard
         self._fleet, self._peer, self._closed = fleet, peer, closed
+        self._clock, self._until_s = clock, clock() + LONGEST_PULL_S
         self._retries = 0
 
     def run(self, register: str, *, is_bulk: bool) -> Message | None:
@@ -70,7 +82,7 @@ class Pull(Generic[P]):
         parts = []
         for i, register in enumerate(registers):
             chunk = self._read(asked.pop(register)) or self._fetch(register, "BACKGROUND")
-            if not isinstance(chunk, Chunk) or chunk.digest != manifest.digest or chunk.index != i:
+            if not isinstance(chunk, Chunk) or chunk.digest != manifest.digest or chunk.index != i or self._is_over():
                 return None
             parts.append(chunk.data)
             if i + CHUNKS_IN_FLIGHT < len(registers):
@@ -81,7 +93,7 @@ class Pull(Generic[P]):
 
     def _fetch(self, register: str, priority: str) -> Message | None:
         """One answer, asked for again when nobody was there just now."""
-        while not self._closed.is_set():
+        while not self._is_over():
             message = self._read(self._ask(register, priority))
             if message is not None or not self._may_retry():
                 return message
@@ -89,7 +101,14 @@ class Pull(Generic[P]):
 
     def _may_retry(self) -> bool:
         self._retries += 1
-        return self._retries <= MAX_RETRIES and not self._closed.wait(RETRY_PAUSE_S * self._retries)
+        if self._retries > MAX_RETRIES:
+            return False
+        self._closed.wait(RETRY_PAUSE_S * self._retries)
+        return not self._is_over()
+
+    def _is_over(self) -> bool:
+        """Whether nobody waits for the answer any more."""
+        return self._closed.is_set() or self._clock() >= self._until_s
 
     def _ask(self, register: str, priority: str) -> P:
         return self._asker.ask(robot_key(self._fleet, self._peer, register), priority)

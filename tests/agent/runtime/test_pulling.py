@@ -9,10 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from agent.fleet.options import FleetOptions
 from agent.runtime import pulling
 from agent.runtime.guard import OpenGuard
 from agent.runtime.pending import NoSuchRegister
-from agent.runtime.pulling import CHUNKS_IN_FLIGHT, MAX_RETRIES, Pull
+from agent.runtime.pulling import CHUNKS_IN_FLIGHT, LONGEST_PULL_S, MAX_RETRIES, Pull
 from protocol.channels import CHUNK_BYTES, chunk_register, robot_key
 from protocol.codec import encode
 from protocol.grid import OccupancyGrid
@@ -31,6 +32,7 @@ class Shelf:
         self.denied: set[str] = set()
         self.asked: list[str] = []
         self.in_flight = self.most_in_flight = 0
+        self.now_s = self.answers_after_s = 0.0
 
     def put(self, register: str, message: Message) -> None:
         self.content[robot_key(FLEET, PEER, register)] = encode(message)
@@ -43,6 +45,7 @@ class Shelf:
 
     def receive(self, pending: str) -> bytes | None:
         self.in_flight -= 1
+        self.now_s += self.answers_after_s
         if pending in self.denied:
             raise NoSuchRegister
         if self.silent.get(pending, 0) > 0:
@@ -58,7 +61,8 @@ def shelf(monkeypatch: pytest.MonkeyPatch) -> Shelf:
 
 
 def pull(shelf: Shelf, closed: threading.Event | None = None) -> Message | None:
-    return Pull(shelf, OpenGuard(), FLEET, PEER, closed or threading.Event()).run(KEY, is_bulk=True)
+    closed = closed or threading.Event()
+    return Pull(shelf, OpenGuard(), FLEET, PEER, closed, clock=lambda: shelf.now_s).run(KEY, is_bulk=True)
 
 
 def coarse(side: int) -> CoarseMap:
@@ -117,6 +121,14 @@ def test_pieces_that_gave_way_to_newer_answers_are_cut_anew(shelf: Shelf) -> Non
     shelf.denied = {keys[2]}
     assert pull(shelf) is None
     assert shelf.asked.count(robot_key(FLEET, PEER, KEY)) == 1 + MAX_RETRIES
+
+
+def test_a_peer_that_dribbles_holds_a_puller_no_longer_than_its_answer_is_waited_for(shelf: Shelf) -> None:
+    shelve_in_pieces(shelf, coarse(700))
+    shelf.answers_after_s = 5.0
+    assert pull(shelf) is None
+    assert LONGEST_PULL_S <= shelf.now_s <= LONGEST_PULL_S + 2 * shelf.answers_after_s
+    assert FleetOptions().fetch_timeout_s <= LONGEST_PULL_S
 
 
 def test_a_lie_about_the_whole_is_found_and_given_up(shelf: Shelf) -> None:
