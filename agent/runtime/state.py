@@ -16,6 +16,7 @@ import logging
 import os
 import re
 import struct
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO, TypeVar
@@ -61,15 +62,12 @@ class StateDirectory:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.last_error = ""
+        self._turn = threading.Lock()  # the keeper saves now and then, the operator when it likes
 
     def save(self, name: str, payload: bytes) -> bool:
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            generations = self._generations(name)
-            newest = generations[0][0] if generations else 0
-            self._write(self.folder / f"{name}.{newest + 1}.state", payload)
-            for _, path in generations[KEPT - 1 :]:
-                path.unlink(missing_ok=True)
+            with self._turn:
+                self._save(name, payload)
         except OSError as error:
             self._failed(f"cannot save {name} in {self.folder}: {error}")
             return False
@@ -77,6 +75,14 @@ class StateDirectory:
             log.info("state: the disk works again in %s", self.folder)
         self.last_error = ""
         return True
+
+    def _save(self, name: str, payload: bytes) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        generations = self._generations(name)
+        newest = generations[0][0] if generations else 0
+        self._write(self.folder / f"{name}.{newest + 1}.state", payload)
+        for _, path in generations[KEPT - 1 :]:
+            path.unlink(missing_ok=True)
 
     def load(self, name: str) -> bytes | None:
         """The newest generation that reads as written; None when there is none."""
@@ -104,8 +110,9 @@ class StateDirectory:
     def forget(self, name: str) -> None:
         """Delete every generation of a name."""
         try:
-            for _, path in _stubbornly(lambda: self._generations(name)):
-                path.unlink(missing_ok=True)
+            with self._turn:
+                for _, path in _stubbornly(lambda: self._generations(name)):
+                    path.unlink(missing_ok=True)
         except OSError as error:
             self._failed(f"cannot delete {name} in {self.folder}: {error}")
 

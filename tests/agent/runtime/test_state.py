@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import threading
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 
 import pytest
 
-from agent.runtime.state import StateDirectory, StateTaken, held, pack
+from agent.runtime.state import StateDirectory, StateTaken, held, pack, unpack
 
 
 def test_the_newest_generation_comes_back_and_two_are_kept(tmp_path: Path) -> None:
@@ -61,6 +64,18 @@ def test_a_disk_that_fails_is_said_and_never_raises(tmp_path: Path, monkeypatch:
     assert state.save("map", b"y")
     assert state.last_error == ""
     assert state.load("map") == b"y"
+
+
+def test_two_threads_that_save_at_once_take_turns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The keeper saves now and then, the operator when it likes."""
+    state, go = StateDirectory(tmp_path), threading.Event()
+    monkeypatch.setattr(os, "fsync", lambda _: go.wait(10.0))
+    with ThreadPoolExecutor() as pool:
+        saves = [pool.submit(state.save, "mapper", payload) for payload in (b"first", b"second")]
+        wait(saves, timeout=0.1)
+        go.set()
+    assert [save.result() for save in saves] == [True, True]
+    assert {unpack(path.read_bytes()) for path in tmp_path.glob("*.state")} == {b"first", b"second"}
 
 
 def test_names_do_not_mix(tmp_path: Path) -> None:
