@@ -53,7 +53,7 @@ class Watcher:
         self._settings = settings
         self._guard = guard_for(settings, secrets.randbits(63))
         self._exchange = Exchange(settings, lambda _: None, subscriptions(settings.fleet))
-        self._robots: dict[str, Heard] = {}
+        self._robots: dict[str, Heard] = {}  # who looks at what the listener writes copies it first
         self._global: tuple[GlobalMeta, TileMap, OccupancyGrid] | None = None
         self._statements: deque[Statement] = deque(maxlen=KEPT_STATEMENTS)
         self._features = DrawnFeatures(self.grid)
@@ -133,7 +133,8 @@ class Watcher:
     def _pull_global(self) -> None:
         """The global map of the largest group, from its composer."""
         now_s = time.monotonic()
-        metas = [h.meta for h in self._robots.values() if h.meta is not None and now_s - h.heard_s < LOST_AFTER_S]
+        heard = list(self._robots.values())
+        metas = [h.meta for h in heard if h.meta is not None and now_s - h.heard_s < LOST_AFTER_S]
         best = max(metas, key=lambda meta: (len(meta.members), meta.seq), default=None)
         if best is None or len(best.members) < 2:
             self._global = None
@@ -178,7 +179,7 @@ class Watcher:
             "poses": {n: plain_pose(b.T_map_robot) for n, b in beats.items() if b.T_map_robot is not None and not b.is_frozen},
             "maps": {name: plain_map(version, grid) for name, (version, grid) in grids.items()},
             "peers": [self._peer(heard, now_s) for _, heard in sorted(robots.items())],
-            "attempts": [plain_statement(statement) for statement in self._statements],
+            "attempts": [plain_statement(statement) for statement in list(self._statements)],
             "problems": [] if self._exchange.links() else ["no link to any robot yet: is --connect right, and is one running?"],
             "facts": {
                 "robots heard": str(len(robots)),
@@ -190,7 +191,7 @@ class Watcher:
 
     def _peer(self, heard: Heard, now_s: float) -> dict[str, Any]:
         silent_s = now_s - heard.heard_s
-        factors = [s.evidence.match_factor for s in self._statements if heard.robot in (s.robot, s.other)]
+        factors = [s.evidence.match_factor for s in list(self._statements) if heard.robot in (s.robot, s.other)]
         return {
             "robot": heard.robot,
             "state": "lost" if silent_s > LOST_AFTER_S else "alive",
