@@ -51,6 +51,9 @@ def state_of(mapper: Mapper) -> State:
         "epoch": mapper.epoch,
         "loops_closed": mapper.loops_closed,
         "status": mapper.status.value,
+        "wheels.stretch": mapper.wheels.stretch,
+        "wheels.sums": mapper.wheels.sums,
+        "usual_fraction": mapper.usual_fraction,
         "contradictions": mapper.contradictions,
         "confirmations_missing": mapper.confirmations_missing,
         "lost_since_s": mapper.lost_since_s,
@@ -166,6 +169,9 @@ def put_state(mapper: Mapper, state: State) -> None:
         )
     mapper.rng.bit_generator.state = state["rng"]
     mapper.epoch, mapper.status = state["epoch"], MapperStatus(state["status"])
+    if "wheels.sums" in state:  # maps saved by an older program have none
+        mapper.wheels.stretch, mapper.wheels.sums = state["wheels.stretch"], state["wheels.sums"]
+        mapper.usual_fraction = state["usual_fraction"]
     mapper.contradictions, mapper.confirmations_missing = state["contradictions"], state["confirmations_missing"]
     mapper.lost_since_s, mapper.last_ranges = state["lost_since_s"], state["last_ranges"]
     mapper.repeats, mapper.repeats_since_s = state["repeats"], state["repeats_since_s"]

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.mapping.loop_closure import LoopClosed
+from agent.mapping.wheel_check import WheelFigures
 from protocol.geometry import SE2
 from protocol.grid import OccupancyGrid
 
@@ -52,6 +53,8 @@ class MapEstimate:
     first_tile: tuple[int, int]  # (row, col) of the tile at the grid's corner, in tiles from the map's origin
     tile_revisions: NDArray[np.int64]  # (rows, cols) revision that last changed each tile
     loops_closed: int = 0  # times the map was bent, in all epochs
+    wheels: WheelFigures | None = None  # what the wheels tell against what the scans show; None until it is known
+    usual_fraction: float = 1.0  # how much of the last hundred scans lay on mapped walls, 0 to 1
 
     def changed_tiles(self, since_revision: int) -> list[tuple[int, int]]:
         """(row, col) of tiles changed after a revision, counted from the map's origin: they keep their names as it grows."""

@@ -28,6 +28,7 @@ from agent.mapping.relocalization import Relocalization
 from agent.mapping.scan_matching import UNCONSTRAINED_RATIO
 from agent.mapping.scan_points import ScanPoints, laser_position_m, reference_stamp_s, scan_points
 from agent.mapping.tracking import GOOD_FRACTION, SURE_FRACTION, Tracked
+from agent.mapping.wheel_check import WheelCheck
 from hw.readings import LaserScan, Odometry
 from protocol.geometry import wrap_angle
 from protocol.grid import OccupancyGrid
@@ -38,6 +39,7 @@ CONTRADICTED = 0.35  # share of a scan that the map rules out; a crowd of people
 LOST_AFTER = 5  # scans in a row that contradict the map before the robot looks for itself elsewhere
 CONFIRMED_AFTER = 5  # scans in a row that fit, after it found itself, before it draws again
 NEW_MAP_AFTER_S = 10.0  # of looking everywhere in vain
+USUAL_OVER = 100  # scans
 SKEWED_RAD = math.radians(3.0)  # of a revolution: a wheel spun, and the scan is a spiral; it is followed, not drawn
 STUCK_AFTER = 3  # identical scans in a row, while the wheels turn
 STUCK_MOVED_M = 0.05
@@ -54,6 +56,8 @@ class Mapper:
         self.options = options
         self.rng = np.random.default_rng(seed)
         self.odometry = OdometryTrack(options.max_speed_m_s, options.max_turn_rad_s)
+        self.wheels = WheelCheck()
+        self.usual_fraction = 1.0  # of a scan that lies on mapped walls
         self.fit = fit
         self.map = LocalMap(options, self.rng, fit)
         self.epoch = 0
@@ -97,7 +101,9 @@ class Mapper:
         if not self._is_believable(points, tracked):
             return self._contradicted(points, tracked)
         self.contradictions = 0
+        self.usual_fraction += (tracked.fraction - self.usual_fraction) / USUAL_OVER
         skew_rad = self._skew_rad(points, motion, tracked)
+        self._check_wheels(motion, tracked, skew_rad)
         self.map.note_motion(motion)
         self.confirmations_missing = max(self.confirmations_missing - 1, int(skew_rad > SKEWED_RAD))
         is_keyframe = self.confirmations_missing == 0 and self.map.is_keyframe(points.stamp_s, tracked.pose)
@@ -119,6 +125,14 @@ class Mapper:
             return 0.0
         slipped_rad = abs(wrap_angle(float(tracked.pose[2] - self.map.predicted(motion)[2])))
         return slipped_rad * min(points.revolution_s / seconds, 1.0)
+
+    def _check_wheels(self, motion: Motion, tracked: Tracked, skew_rad: float) -> None:
+        """What matching adds to a step of the wheels; a step that jumps or slips is no measure of them."""
+        if not motion.is_known or tracked.is_jump or skew_rad > SKEWED_RAD:
+            self.wheels.break_off()
+            return
+        added = as_pose(self.map.predicted(motion)).inverse() @ as_pose(tracked.pose)
+        self.wheels.add(motion.T_from_to, added, is_open=tracked.weakest < UNCONSTRAINED_RATIO)
 
     def _is_believable(self, points: ScanPoints, tracked: Tracked) -> bool:
         """A good fit where the robot can be, a very good one where its wheels say it cannot (they slip, but a LIDAR that tilts
@@ -232,6 +246,8 @@ class Mapper:
             first_tile=(int(grid.first_tile[0]), int(grid.first_tile[1])),
             tile_revisions=grid.tile_revisions.copy(),
             loops_closed=self.loops_closed,
+            wheels=self.wheels.figures(),
+            usual_fraction=self.usual_fraction,
         )
 
     def checkpoint(self) -> bytes:

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 
-from agent.mapping.estimate import MapEstimate
+from agent.mapping.estimate import MapEstimate, MapperStatus, ScanOutcome
 from agent.mapping.mapper import Mapper
 from agent.runtime.latest import Latest
 from agent.runtime.pace import REAL, Pace
@@ -40,6 +40,8 @@ class MapWorker:
         self.loop_places: deque[SE2] = deque(maxlen=MAX_LOOP_PLACES)  # where the robot was when a loop was closed, to look at
         self.is_paused = False
         self.scans = 0
+        self.held = 0  # scans in a row that were not believed ...
+        self.held_reason = ""  # ... and why the newest was not
         self.scan_cpu_s = 0.0  # CPU of this thread spent on scans
         self._readings, self._pace = readings, pace
         self._period_s = estimate_period_s
@@ -68,10 +70,15 @@ class MapWorker:
             log.info("loop closed moved_m=%.2f turned_deg=%.1f", outcome.loop.moved_m, turned_deg)
         self.scan_cpu_s += time.thread_time() - started
         self.scans += 1
+        self._note_held(outcome)
         now = self._pace.clock()
         if now >= self._next_estimate_s:
             self._next_estimate_s = now + self._period_s
             self.publish()
+
+    def _note_held(self, outcome: ScanOutcome) -> None:
+        is_held = outcome.status in (MapperStatus.LOST, MapperStatus.STUCK, MapperStatus.BLIND)
+        self.held, self.held_reason = (self.held + 1, outcome.reason) if is_held else (0, "")
 
     def publish(self) -> None:
         before, self.newest = self.newest, self.mapper.estimate()

@@ -28,6 +28,12 @@ def families(status: Mapping[str, Any]) -> Iterator[tuple[str, str, str, list[Sa
     yield "scans_lost_total", "counter", "Scans that came faster than the mapper could follow.", [({}, mapping["scans_lost"])]
     yield "scan_cpu_seconds", "gauge", "CPU time per scan, on average.", [({}, (mapping["cpu_ms_per_scan"] or 0.0) / 1e3)]
     yield "map_known_square_metres", "gauge", "Area of the local map.", [({}, mapping.get("known_m2", 0.0))]
+    yield "scan_fit_ratio", "gauge", "How much of the last scans lies on mapped walls.", [({}, mapping.get("fraction", 1.0))]
+    wheels: Mapping[str, float] = mapping.get("wheels") or {}
+    errors: list[Sample] = [({"of": of}, wheels[f"{of}_percent"] / 1e2) for of in ("length", "turn") if wheels]
+    yield "wheels_error_ratio", "gauge", "Ways and turns that the scans show beyond what the wheels tell.", errors
+    drifts: list[Sample] = [({"of": of}, wheels[name]) for of, name in (("drift", "drift_deg_m"), ("slip", "slip_deg")) if wheels]
+    yield "wheels_heading_degrees", "gauge", "Off over one metre: always alike (drift), by chance (slip).", drifts
     yield "global_map_known_square_metres", "gauge", "Area of the fleet's map.", [({}, fused.get("known_m2", 0.0))]
     yield (
         "global_map_conflicting_cells",

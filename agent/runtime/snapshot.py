@@ -10,6 +10,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from agent.fleet.state import FleetState
+from agent.mapping.wheel_check import WheelFigures
 from agent.runtime.problems import problems
 from hw.device import Source
 from protocol.geometry import SE2
@@ -75,10 +76,30 @@ def mapping(node: Node) -> dict[str, Any]:
             "particles": round(estimate.effective_particles, 1),
             "loops_closed": estimate.loops_closed,
             "closures": [plain_pose(place)[:2] for place in list(worker.loop_places)],
+            "fraction": round(estimate.usual_fraction, 3),
+            "wheels": wheels(estimate.wheels),
             "pose": plain_pose(estimate.T_map_robot),
             "pose_stamp_s": estimate.stamp_s,
         }
     return facts
+
+
+def wheels(figures: WheelFigures | None) -> dict[str, float | None] | None:
+    """What the scans show beyond what the wheels tell, with standard errors; null until it is known."""
+    if figures is None:
+        return None
+    degrees = {name: math.degrees(getattr(figures, name)) for name in ("drift_rad_m", "drift_error_rad_m", "slip_rad")}
+    facts = {
+        "length_percent": 100.0 * figures.length,
+        "length_error_percent": 100.0 * figures.length_error,
+        "turn_percent": 100.0 * figures.turn,
+        "turn_error_percent": 100.0 * figures.turn_error,
+        "drift_deg_m": degrees["drift_rad_m"],
+        "drift_error_deg_m": degrees["drift_error_rad_m"],
+        "slip_deg": degrees["slip_rad"],
+        "stretches": float(figures.stretches),
+    }
+    return {name: round(value, 2) if math.isfinite(value) else None for name, value in facts.items()}
 
 
 def devices(node: Node) -> list[dict[str, Any]]:

@@ -4,8 +4,9 @@
                                                    [--variations plain,...|all] [--json]
 
 A row per run: pose error at the end and at its worst, share of known cells that are right (a wall may lie one cell off),
-CPU share of one core for odometry at 50 Hz and (where a variation does not say otherwise) 360 beams at 10 Hz, and scans that
-were held back.  Variations are LIDARs, wheels and company that a stranger may have: mapping_drives.py.
+CPU share of one core for odometry at 50 Hz and (where a variation does not say otherwise) 360 beams at 10 Hz, scans that
+were held back, and how many sentences the wheels earn.
+Variations are LIDARs, wheels and company that a stranger may have: mapping_drives.py.
 """
 
 from __future__ import annotations
@@ -72,6 +73,7 @@ def run(name: str, variation: str, seed: int, minutes: float, particles: int) ->
         "keyframes": len(mapper.map.filter.line),
         "loops": mapper.loops_closed,
         "epoch": mapper.epoch,
+        "said": len(list(estimate.wheels.sentences())) if estimate.wheels is not None else 0,
     }
 
 

@@ -63,6 +63,10 @@ def test_metrics_are_prometheus_text() -> None:
     assert 'mapquilt_peer_match_factor{robot="r1",peer="r\\"2\\n"} 0.97' in text
     assert 'mapquilt_merge_seconds{robot="r1",quantile="0.9"} 4.2' in text
     assert 'mapquilt_edge_age_seconds{robot="r1",a="r1",b="r\\"2\\n"} 3.5' in text
+    told = {"length_percent": 0.4, "turn_percent": 8.0, "drift_deg_m": 0.3, "slip_deg": 1.5}
+    with_wheels = metrics({**STATUS, "mapping": {**STATUS["mapping"], "wheels": told}})
+    assert 'mapquilt_wheels_error_ratio{robot="r1",of="turn"} 0.08' in with_wheels
+    assert 'mapquilt_wheels_heading_degrees{robot="r1",of="slip"} 1.5' in with_wheels
     names = [line.split()[2] for line in text.splitlines() if line.startswith("# TYPE")]
     assert len(names) == len(set(names))
 
