@@ -5,7 +5,8 @@
     DIR/bundles/<robot>/                          what is copied to that robot: fleet.key, ca.pem, its certificate, acl.json
 
 Every robot carries the rules of the whole fleet (acl.json), because between peers the receiver is the one who checks: after
-enrolling or revoking a member all bundles are written anew, and take effect when a robot is started again.
+enrolling or revoking a member all bundles are written anew, and take effect when a robot is started again.  Revoking draws a
+new fleet.key, too: robots with `security = "shared"` hear one another again once all have it.
 """
 
 from __future__ import annotations
@@ -70,6 +71,8 @@ def act(args: argparse.Namespace, members: dict[str, Any]) -> str:
             raise CommandError(f"{name} is no member; mapquilt fleet list {args.folder}", USAGE)
         else:
             shutil.rmtree(args.folder / "bundles" / name, ignore_errors=True)
+    if args.action == "revoke":
+        draw_secret(args.folder)
     write_private(args.folder / "members.json", json.dumps(members, indent=1).encode())
     spread(args.folder, members)
     verb = "enrolled" if args.action == "enroll" else "revoked"
@@ -82,12 +85,17 @@ def init(folder: Path, fleet: str) -> None:
     if (folder / "members.json").exists():
         raise CommandError(f"{folder} holds a fleet already; enroll into it, or choose another directory", USAGE)
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    write_private(folder / "fleet.key", secrets.token_hex(32).encode() + b"\n")
+    draw_secret(folder)
     openssl("ecparam", "-name", "prime256v1", "-genkey", "-noout", "-out", folder / "ca.key")
     subject = ("-subj", f"/CN=mapquilt fleet {fleet}")
     openssl("req", "-x509", "-new", "-key", folder / "ca.key", "-days", CA_DAYS, *subject, "-out", folder / "ca.pem")
     (folder / "ca.key").chmod(0o600)
     write_private(folder / "members.json", json.dumps({"fleet": fleet, "members": {}}, indent=1).encode())
+
+
+def draw_secret(folder: Path) -> None:
+    """A new `fleet.key`; who was revoked knows the old one."""
+    write_private(folder / "fleet.key", secrets.token_hex(32).encode() + b"\n")
 
 
 def enroll(folder: Path, robot: str) -> None:

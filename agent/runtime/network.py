@@ -63,10 +63,13 @@ class NetworkSettings:
                 "profile infrastructure needs a router: give connect = ['tcp/HOST:7447'] (see mapquilt router)"
             )
         if self.security == "shared" and self.key_file is None:
-            raise NetworkConfigError("security shared needs the fleet's key file: mapquilt fleet init makes one")
+            raise NetworkConfigError(
+                "security shared needs the fleet's key file: name it in fleet.key_file (mapquilt fleet init makes one)"
+            )
         if self.security == "mtls" and self.certificates is None:
             raise NetworkConfigError(
-                "security mtls needs a certificate directory: mapquilt fleet init, then mapquilt fleet enroll ROBOT"
+                "security mtls needs the robot's certificate directory: name it in fleet.certificates "
+                "(mapquilt fleet init, then mapquilt fleet enroll ROBOT, makes keys/bundles/ROBOT)"
             )
         if self.security == "open" and not self.allow_open:
             for endpoint in self.endpoints():

@@ -112,6 +112,13 @@ def test_a_given_map_speaks_in_its_own_name_with_its_robots_keys(keys: Path, lev
     assert decode(guard_for(settings(keys, "a"), 1).open(sealed, "b-prior1")).robot == "b-prior1"
 
 
+def test_a_revoked_robot_s_secret_opens_nothing_any_more(keys: Path) -> None:
+    b, stolen = guard_for(shared(keys, "b"), 2), replace(shared(keys, "a"), key_file=keys / "stolen-c" / "fleet.key")
+    with pytest.raises(RemoteProtocolError):
+        b.open(guard_for(stolen, 1).seal(b"words"), "a")
+    assert (keys / "bundles" / "a" / "fleet.key").read_bytes() == (keys / "fleet.key").read_bytes()
+
+
 def test_unsealed_foreign_replayed_and_misnamed_words_are_refused(keys: Path) -> None:
     a, b = guard_for(shared(keys, "a"), 1), guard_for(shared(keys, "b"), 2)
     foreign = SharedGuard(bytes(32), "a", 1)
