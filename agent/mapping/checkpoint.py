@@ -21,6 +21,7 @@ from agent.mapping.loop_closure import LoopCloser
 from agent.mapping.path_graph import LoopEdge
 from agent.mapping.redrawing import Drawing
 from agent.mapping.state_block import CheckpointError, State, opened, sealed
+from agent.mapping.trajectory import ROW
 from protocol.geometry import SE2
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ def state_of(mapper: Mapper) -> State:
         "keyframe_pose": local.keyframe_pose,
         "keyframe_s": local.keyframe_s,
         "keyframe_variance": local.keyframe_variance,
-        "scans": local.scans.rows,
+        "scans": local.scans.rows.view(np.uint8).reshape(-1, ROW.itemsize),
         **search_state(mapper),
         **filter_state(mapper),
         **drawing_state(local.drawing),
@@ -77,8 +78,7 @@ def state_of(mapper: Mapper) -> State:
 
 
 def loops_state(loops: LoopCloser) -> State:
-    edges = [*loops.edges, *([] if loops.pending is None else [loops.pending])]
-    rows = [(edge.a, edge.b, edge.T_a_b.x_m, edge.T_a_b.y_m, edge.T_a_b.theta_rad) for edge in edges]
+    rows = [(edge.a, edge.b, edge.T_a_b.x_m, edge.T_a_b.y_m, edge.T_a_b.theta_rad) for edge in loops.every_edge()]
     return {
         "loops.edges": np.array(rows, np.float64).reshape(-1, 5),
         "loops.is_pending": loops.pending is not None,
@@ -145,6 +145,7 @@ def drawing_state(drawing: Drawing) -> State:
         "drawn.unit_m": np.array([s.unit_m for s in scans]),
         "drawn.hit_bits": np.concatenate([np.empty(0, np.uint8), *(s.hit_bits for s in scans)]),
         "drawn.is_partial": np.array([s.is_partial for s in scans], bool),
+        "drawn.is_all_round": np.array([s.is_all_round for s in scans], bool),
         "fresh.poses": -1 if drawing.fresh is None else len(drawing.fresh.poses),
         "fresh.target": drawing.target,
         "fresh.is_bent": drawing.is_bending,
@@ -185,7 +186,7 @@ def put_state(mapper: Mapper, state: State) -> None:
         state["keyframe_s"],
         state["keyframe_variance"],
     )
-    local.scans.rows = state["scans"]
+    local.scans.rows = state["scans"].view(ROW)[:, 0]
     put_filter(mapper, state)
     put_drawing(local.drawing, state)
     put_loops(local.loops, state)
@@ -238,10 +239,12 @@ def put_kept(drawing: Drawing, state: State) -> None:
     ends, bits = (
         np.split(state[name], np.cumsum(n)[:-1]) for name, n in (("drawn.ends", sizes), ("drawn.hit_bits", -(-sizes // 8)))
     )
-    rows = zip(state["drawn.kept"].tolist(), ends, state["drawn.unit_m"].tolist(), bits, state["drawn.is_partial"], strict=True)
-    for k, one_ends, unit_m, one_bits, is_partial in rows if len(sizes) else ():
+    is_partial = state["drawn.is_partial"].tolist()
+    is_all_round = state["drawn.is_all_round"].tolist()
+    rows = zip(state["drawn.kept"].tolist(), ends, state["drawn.unit_m"].tolist(), bits, is_partial, is_all_round, strict=True)
+    for k, one_ends, unit_m, one_bits, partial, all_round in rows if len(sizes) else ():
         # Each its own, or the scans that are let go later would stay with the others.
-        drawing.scans[k] = KeptScan(one_ends.copy(), unit_m, one_bits.copy(), bool(is_partial))
+        drawing.scans[k] = KeptScan(one_ends.copy(), unit_m, one_bits.copy(), partial, all_round)
 
 
 def put_grid(grid: LogOddsGrid, name: str, state: State) -> None:

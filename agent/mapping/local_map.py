@@ -12,6 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.mapping.forgetting import forget_keyframes
 from agent.mapping.loop_closure import FitMaps, LoopClosed, LoopCloser
 from agent.mapping.motion import Motion
 from agent.mapping.options import MappingOptions
@@ -83,7 +84,7 @@ class LocalMap:
             return Motion(SE2.identity(), is_known=False)
         two = self.scans.rows[-2:].tolist()
         (before_s, *_), (last_s, *_) = two
-        before, last = (as_pose(self.filter.line[int(k)]) @ SE2(*relative) for _, k, *relative in two)
+        before, last = (as_pose(self.filter.line[k]) @ SE2(*map(float, relative)) for _, k, relative in two)
         step = before.inverse() @ last
         share = (stamp_s - last_s) / max(last_s - before_s, 1e-3)
         if share > 3.0:
@@ -110,6 +111,7 @@ class LocalMap:
         bent = self.loops.look(self.drawing, self.filter.line)
         if bent is not None:
             self.drawing.bend(bent, self.filter.line)
+        forget_keyframes(self)
 
     def redraw(self) -> LoopClosed | None:
         """A few scans of a drawing in progress; when a bent one is done, everything stands on it."""

@@ -63,6 +63,10 @@ class LoopCloser:
         self.steps_from: Poses = np.empty((0, 3))  # the path as it was measured, before any loop bent it
         self.breaks: list[int] = []  # keyframes before which the robot was lost and found
 
+    def every_edge(self) -> list[LoopEdge]:
+        """What is known, and at the end what waits to be confirmed."""
+        return [*self.edges, *([] if self.pending is None else [self.pending])]
+
     def look(self, drawing: Drawing, line: Poses) -> Poses | None:
         """After a keyframe: the bent path, (K, 3), when a loop is found."""
         if self.fit is None or len(line) <= self.next_look or drawing.is_bending:

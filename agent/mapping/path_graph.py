@@ -28,6 +28,10 @@ class LoopEdge:
     b: int
     T_a_b: SE2
 
+    def renumbered(self, numbers: NDArray[np.int64]) -> LoopEdge:
+        """The same edge when keyframe k is called `numbers[k]`."""
+        return LoopEdge(int(numbers[self.a]), int(numbers[self.b]), self.T_a_b)
+
 
 def bent_path(line: Poses, measured: Poses, breaks: list[int], loops: list[LoopEdge]) -> Poses | None:
     """The path that fits steps and loops best; None when the last two loops are not among those that fit."""

@@ -129,7 +129,8 @@ class Drawing:
             return
         kept = np.array(list(self.scans))
         kept = kept[kept < self.oldest + len(self.poses) - NEVER_THINNED]
-        for k in kept[needless(self.poses[kept - self.oldest])].tolist():
+        is_all_round = np.array([self.scans[k].is_all_round for k in kept.tolist()], bool)
+        for k in kept[needless(self.poses[kept - self.oldest], is_all_round)].tolist():
             del self.scans[k]
         if sum(scan.nbytes for scan in self.scans.values()) > KEPT_BYTES:
             self._draw_for_good()

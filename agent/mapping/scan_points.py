@@ -6,6 +6,7 @@ the robot turned is put where it belongs.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +26,7 @@ WIDEST_WALL_M = 1.0  # for its direction: at 3 m two of three seeds missed a loo
 STRAIGHT = np.float32(0.985)  # cosine of 10 degrees
 STRAIGHT_CHORD = np.float32(0.8)  # cosine: chords that bend by more than 37 degrees meet in a corner
 MOST_SURFELS = 180  # beams 2 degrees apart say what can be said; four times as many cost four times the time
+WIDEST_BLIND_RAD = math.radians(30.0)  # of a LIDAR that looks all round: a mast, or a packet that was lost
 STEEPEST = 0.85  # change of range per gap: beyond it the surface is seen so flat that it may be a depth jump
 
 
@@ -38,6 +40,7 @@ class ScanPoints:
     surfels: NDArray[np.float32]  # (M, 4) hits to match, one a voxel: x, y, and the unit normal there, (0, 0) where unknown
     surface_m: NDArray[np.float32]  # (K, 2) hits and the surfaces between neighbouring ones, one a voxel
     is_partial: bool
+    is_all_round: bool  # from one place it sees the same, whichever way the robot looks
     revolution_s: float  # from its first beam to its last
 
     @property
@@ -78,6 +81,7 @@ def scan_points(scan: LaserScan, track: OdometryTrack, options: MappingOptions) 
         thinned(with_normals(hits), MOST_SURFELS),
         surface_points(ends, is_hit, cut),
         scan.is_partial,
+        looks_all_round(scan.angles_rad),
         scan.duration_s,
     )
 
@@ -85,6 +89,12 @@ def scan_points(scan: LaserScan, track: OdometryTrack, options: MappingOptions) 
 def surface_points(ends_m: NDArray[np.float32], is_hit: NDArray[np.bool_], ranges_m: NDArray[np.float64]) -> NDArray[np.float32]:
     """(K, 2) hits and the surfaces between neighbouring ones, one a voxel."""
     return one_per_voxel(np.vstack([one_per_voxel(ends_m[is_hit]), between(ends_m, is_hit, ranges_m)]))
+
+
+def looks_all_round(angles_rad: NDArray[np.float32]) -> bool:
+    """Whether beams go in every direction, returned or not."""
+    sorted_rad = np.sort(angles_rad % np.float32(math.tau))
+    return len(sorted_rad) > 0 and float(np.diff(sorted_rad, append=sorted_rad[0] + math.tau).max()) < WIDEST_BLIND_RAD
 
 
 def matching_reach_m(returns_m: NDArray[np.float64], options: MappingOptions) -> float:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 MAGIC = b"MQMC"
-VERSION = 3
+VERSION = 4
 LARGEST_BYTES = 1 << 30  # unpacked; a map of a square kilometre stays below
 DTYPES = {"bool", "uint8", "uint16", "int8", "int16", "int32", "int64", "float32", "float64"}
 

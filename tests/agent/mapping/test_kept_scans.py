@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -33,7 +34,7 @@ def laps(n: int, keyframes: int = 60) -> np.ndarray:
 
 
 def left(poses: np.ndarray) -> list[int]:
-    return np.flatnonzero(~needless(poses)).tolist()
+    return np.flatnonzero(~needless(poses, np.zeros(len(poses), bool))).tolist()
 
 
 def test_a_kept_scan_is_the_scan_to_a_millimetre() -> None:
@@ -105,3 +106,12 @@ def test_a_long_trajectory_stays_whole_and_grows_coarser_with_age(monkeypatch: p
     assert np.allclose(x_m, 10 * stamps_s)
     gaps_s = np.diff(stamps_s)
     assert gaps_s[-40:].max() < 0.11 < gaps_s[:5].min()
+
+
+def test_a_lidar_that_looks_all_round_needs_no_second_heading() -> None:
+    all_round = scan_at(ROOMS, SE2(0.0, 0.0, 0.0), 0.0, np.random.default_rng(0))
+    half = replace(all_round, angles_rad=all_round.angles_rad / 2)
+    seen = [scan_points(scan, OdometryTrack(3.0, 6.0), OPTIONS).is_all_round for scan in (all_round, half)]
+    assert seen == [True, False]
+    turning = np.stack([np.zeros(400), np.zeros(400), np.arange(400) * (math.tau / 50)], axis=1)
+    assert [np.count_nonzero(~needless(turning, np.full(400, is_round))) for is_round in (True, False)] == [3, 24]
