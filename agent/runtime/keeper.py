@@ -35,7 +35,7 @@ REOPEN_AFTER_S = 20.0  # stalls of 10 s are normal and mean nothing
 REOPEN_AT_MOST_EVERY_S = 300.0
 CHECKPOINT_WITHIN_S = 1.0
 MEMORY_EVERY_S = 2.0  # a transform that is refined all the time does not wear the disk out
-GIVE_BACK_EVERY_S = 10.0
+GIVE_BACK_EVERY_S = 3.0  # 2 ms each
 OPEN_EVERY_S = 2.0  # a client looks for its router this often
 
 

@@ -24,6 +24,6 @@ def keep_memory_small() -> None:
 
 
 def give_back_memory() -> None:
-    """Pages that are free between others that are not: 4 MB every ten seconds of three merged robots, in less than 2 ms."""
+    """Pages that are free between others that are not, in less than 2 ms."""
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
