@@ -71,7 +71,7 @@ def test_wheels_that_tell_something_else_and_scans_that_do_not_fit_are_problems(
         "length_percent": 0.0, "length_error_percent": 0.1, "turn_percent": 8.0, "turn_error_percent": 0.2,
         "drift_deg_m": 0.0, "drift_error_deg_m": 0.06, "slip_deg": 1.15, "stretches": 99.0,
     }  # fmt: skip
-    mapper.says = replace(mapper.says, wheels=None, usual_fraction=0.62)
+    mapper.says = replace(mapper.says, wheels=None, usual_fraction=0.52)
     worker.publish()
     (sentence,) = mapping_problems(worker)
-    assert "62% of them lies on its walls" in sentence
+    assert "52% of them lies on its walls" in sentence
