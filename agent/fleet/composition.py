@@ -17,6 +17,7 @@ from agent.fleet.history import History
 from agent.fleet.ledger import Ledger
 from agent.fleet.recipe import Recipe, grid_of, tiles_of, written
 from agent.fleet.succession import composer_of, holds_unknown_map, recipes_of, root_of
+from agent.fleet.timetable import LONG_AGO_S
 from protocol.channels import MAX_PUSH_BYTES
 from protocol.codec import encode
 from protocol.grid import OccupancyGrid
@@ -56,7 +57,7 @@ class Composition:
         self.let_go: set[str] = set()  # robots that are gone and in no recipe of ours
         self._made: Recipe | None = None  # what `global_map` was made from
         self._running: tuple[int, Recipe, float] | None = None
-        self._composed_s = -1e9
+        self._composed_s = LONG_AGO_S
         self._fusing_took_s: deque[float] = deque(maxlen=2)  # the last ones; a single long one is a process that was stopped
         self._grouped_s: float | None = None  # since when we are not alone
         self._followed_s: float | None = None  # since when there was a usable recipe, or we began to wait for one
@@ -243,7 +244,8 @@ class Composition:
 
     def _be_alone(self) -> None:
         self.composer = self.root = self._ledger.robot
-        self._followed_s = self._grouped_s = self._made = self._running = self.meta = None
+        self._followed_s = self._grouped_s = self._left_out_s = self._made = self._running = self.meta = None
+        self._objection = ""
         if self.global_map is not None:
             self.global_map = None
             self.history = History(_KEPT_GLOBAL_MAPS)

@@ -36,7 +36,7 @@ class Group:
     edges: tuple[Edge, ...]
 
     def rerooted(self, root: str) -> Group:
-        """The same layout seen from another member's frame."""
+        """The same layout seen from another member's frame; the others' covariances stay those seen from the old root."""
         if root == self.root:
             return self
         T_new_old = self.T_root[root].inverse()
@@ -96,20 +96,33 @@ def connected(edges: Iterable[Edge], robot: str) -> list[Edge]:
 
 def _components(edges: tuple[Edge, ...]) -> list[list[Edge]]:
     """Edges by connected component."""
-    leader: dict[str, str] = {}
-
-    def find(robot: str) -> str:
-        while leader.setdefault(robot, robot) != robot:
-            leader[robot] = leader[leader[robot]]
-            robot = leader[robot]
-        return robot
-
+    joined = _Joined()
     for edge in edges:
-        leader[find(edge.a)] = find(edge.b)
+        joined.join(edge.a, edge.b)
     by_leader: dict[str, list[Edge]] = defaultdict(list)
     for edge in edges:
-        by_leader[find(edge.a)].append(edge)
+        by_leader[joined.leader(edge.a)].append(edge)
     return list(by_leader.values())
+
+
+class _Joined:
+    """Disjoint sets of robots, each with one of them as its leader."""
+
+    def __init__(self) -> None:
+        self._above: dict[str, str] = {}
+
+    def leader(self, robot: str) -> str:
+        above = self._above
+        while above.setdefault(robot, robot) != robot:
+            above[robot] = above[above[robot]]
+            robot = above[robot]
+        return robot
+
+    def join(self, a: str, b: str) -> bool:
+        """False when they were in one set already."""
+        leader_a, leader_b = self.leader(a), self.leader(b)
+        self._above[leader_a] = leader_b
+        return leader_a != leader_b
 
 
 @functools.lru_cache(maxsize=256)  # an edge changes one group; the others stay as they are
@@ -161,18 +174,10 @@ def _layouts(names: list[str], edges: Sequence[Edge], votes: Mapping[bytes, tupl
 
 def _tree_layout(names: list[str], ranked: list[Edge]) -> dict[str, SE2]:
     """Frames along the spanning tree of the first edges, from the smallest name at identity."""
-    joined = {name: name for name in names}
-
-    def find(name: str) -> str:
-        while joined[name] != name:
-            name = joined[name]
-        return name
-
+    joined = _Joined()
     tree: dict[str, list[tuple[str, SE2]]] = defaultdict(list)
     for edge in ranked:
-        a, b = find(edge.a), find(edge.b)
-        if a != b:
-            joined[max(a, b)] = min(a, b)
+        if joined.join(edge.a, edge.b):
             tree[edge.a].append((edge.b, edge.T_a_b))
             tree[edge.b].append((edge.a, edge.T_a_b.inverse()))
     frames, queue = {names[0]: SE2.identity()}, [names[0]]

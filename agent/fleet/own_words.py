@@ -11,6 +11,7 @@ from agent.fleet.consistency import is_same_drawing
 from agent.fleet.ledger import Ledger, statements_digest
 from agent.fleet.pairs import PairWork
 from agent.fleet.state import Presence
+from agent.fleet.timetable import NEVER_S
 from protocol.channels import MAJOR_VERSION
 from protocol.features import FeatureMap
 from protocol.geometry import SE2
@@ -71,7 +72,7 @@ class OwnWords:
         self._beat_seq += 1
         ledger.send(self._beat(period_s))
         if ledger.timetable.next_hello_s <= now_s:
-            ledger.timetable.next_hello_s = 1e18
+            ledger.timetable.next_hello_s = NEVER_S
             ledger.send(self.hello())
 
     def _beat(self, period_s: float) -> Beat:

@@ -6,6 +6,7 @@ import enum
 from dataclasses import dataclass
 
 from agent.fleet.effects import Match
+from agent.fleet.timetable import LONG_AGO_S
 from protocol.geometry import SE2
 from protocol.messages import Evidence, MapVersion
 
@@ -49,13 +50,13 @@ class Pair:
     conflict_share: float = -1.0  # of the walls, when the edge was first found good; negative: not yet
     failures: int = 0  # checks of the live edge that failed, in a row
     is_urgent: bool = False  # the newest cells contradict the edge
-    renewed_s: float = -1e18
+    renewed_s: float = LONG_AGO_S
     hint: SE2 | None = None  # T_ours_theirs that held before a frame was drawn anew
     refused: Evidence | None = None  # evidence of theirs that we checked and did not find true
     refusals: int = 0  # in a row
     refused_s: float = 0.0
     promise: float = 0.0  # how alike the features are: whom to look at first
-    promise_of: tuple[int, int] = (-1, -1)  # frames and revisions it was computed from
+    promise_of: tuple[int, int] = (-1, -1)  # revisions it was computed from; in a new frame the pair is a new one
     is_courted: bool = False  # its maps may be pulled
     wants_coarse: bool = False
     wants_fine: bool = False

@@ -12,6 +12,9 @@ from agent.merging.result import MatchStatus, MergeResult
 from protocol.geometry import wrap_angle
 from protocol.messages import NO_DIGEST, Evidence, Stance
 
+_NEWS_M, _NEWS_RAD = 0.04, 0.005  # an edge that moved by as much, about a cell, is told to everybody
+_PLAINLY_LOWER = 0.03  # a match factor as far below the gate ends an edge at once; nearer to it one more check decides
+
 
 class PairVerdicts:
     """Turns results into statements."""
@@ -82,7 +85,7 @@ class PairVerdicts:
         pair.failures += 1
         pair.checked = Attempt(now_s, running.area_m2)
         pair.checked_digests = (running.ours.digest, running.theirs.digest)
-        is_plain = result.factor.value < self._ledger.options.min_match_factor - 0.03
+        is_plain = result.factor.value < self._ledger.options.min_match_factor - _PLAINLY_LOWER
         if is_plain or pair.failures >= 2:
             was_urgent = pair.is_urgent
             self._words.withdraw(pair.peer, result.reason, now_s)
@@ -108,7 +111,7 @@ class PairVerdicts:
         """Whether the edge is worth proposing anew with better figures."""
         T, T_old = result.T_ours_theirs, running.job.T_ours_theirs
         assert T is not None and T_old is not None
-        has_moved = T.distance_m(T_old) > 0.04 or abs(wrap_angle(T.theta_rad - T_old.theta_rad)) > 0.005
+        has_moved = T.distance_m(T_old) > _NEWS_M or abs(wrap_angle(T.theta_rad - T_old.theta_rad)) > _NEWS_RAD
         cited = {live.map_a.digest, live.map_b.digest}
         is_old = cited != {running.ours.digest, running.theirs.digest} and now_s - pair.renewed_s >= self._ledger.renew_period_s()
         return has_moved or is_old or result.overlap_m2 > live.overlap_m2 * (1.0 + self._ledger.options.renew_growth)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 from agent.fleet.history import History
 from agent.fleet.state import Presence
+from agent.fleet.timetable import LONG_AGO_S
 from agent.fleet.trust import Trust
 from protocol.geometry import SE2
 from protocol.grid import OccupancyGrid
@@ -60,14 +61,14 @@ class Peer:
     boot: int
     heard_s: float
     beat_s: float
-    said_s: float = -1e18  # when its statements were heard last; older beats say nothing about them
+    said_s: float = LONG_AGO_S  # when its statements were heard last; older beats say nothing about them
     hello: Hello | None = None
     beat: Beat | None = None
     announcement: MapAnnouncement | None = None
     coarse: CoarseMap | None = None
     meta: GlobalMeta | None = None
     meta_id: bytes = NO_DIGEST  # of `meta`
-    meta_s: float = -1e18  # when it was heard; older beats may speak of an earlier one
+    meta_s: float = LONG_AGO_S  # when it was heard; older beats may speak of an earlier one
     statements: dict[str, Statement] = field(default_factory=dict)
     statements_seq: int = 0
     statements_digest: bytes | None = None  # over `statements`; None: they changed since

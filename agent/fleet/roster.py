@@ -7,6 +7,7 @@ import math
 from agent.fleet.options import FleetOptions
 from agent.fleet.peer import Ghost, Peer
 from agent.fleet.state import Presence
+from agent.fleet.timetable import LONG_AGO_S
 from protocol.messages import Beat, Hello, MapAnnouncement, Message
 
 _RETIRED_BOOTS = 4
@@ -23,7 +24,7 @@ class Roster:
         self.unmerged: set[str] = set()  # by the operator, heard or not
         self.twins: list[str] = []  # robots of which two lives speak at once
         self.forgotten: list[str] = []  # robots that gave way to others
-        self._look_s = -1e18  # nobody's presence changes before
+        self._look_s = LONG_AGO_S  # nobody's presence changes before
 
     def hear(self, message: Message, now_s: float) -> Peer | None:
         """The peer this message may change; None when it is from a life that is over, or the table is full."""

@@ -31,7 +31,7 @@ class PeerState:
     load: float
     strikes: int
     T_global_robot: SE2 | None
-    pair: str  # "unseen", "coarse", "searching", "ambiguous", "no", "proposed", "verifying", "merged", "withdrawn"
+    pair: str  # "unseen", "coarse", "hopeful", "searching", "ambiguous", "no", "proposed", "verifying", "merged", "withdrawn"
     reason: str
     attempts: int
     match_factor: float

@@ -1,8 +1,11 @@
-"""Time as the fleet logic sees it: a clock that only flows forward, and when what is due next."""
+"""Time as the fleet logic sees it: a clock that only flows forward, and what is due when."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+
+LONG_AGO_S, NEVER_S = -math.inf, math.inf
 
 
 class Clock:
@@ -29,7 +32,7 @@ class Clock:
 class Timetable:
     """Moments of `Clock` before which nothing is done."""
 
-    next_beat_s: float = -1e18
-    next_announce_s: float = -1e18
-    next_scan_s: float = -1e18
-    next_hello_s: float = -1e18
+    next_beat_s: float = LONG_AGO_S
+    next_announce_s: float = LONG_AGO_S
+    next_scan_s: float = LONG_AGO_S
+    next_hello_s: float = LONG_AGO_S

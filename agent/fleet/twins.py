@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from agent.fleet.ledger import Ledger
+from agent.fleet.timetable import LONG_AGO_S
 from protocol.messages import Beat, Message
 
 _GONE_AFTER_BEATS = 3.0
@@ -17,7 +18,7 @@ class _Twin:
     boot: int
     seq: int = 0
     beats: int = 0
-    heard_s: float = -1e9
+    heard_s: float = LONG_AGO_S
     period_s: float = 1.0
 
 
