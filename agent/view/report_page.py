@@ -23,11 +23,9 @@ REASONS = {  # reason code: what it means for the person who reads it
     "little common wall": "too few metres of wall seen by both: more overlap is needed",
     "low match factor": "too many cells contradict each other at the best place",
     "walls conflict": "one robot saw walls where the other saw free space",
-    "walls cross free space": "one robot saw free space through the other's walls",
     "unobservable direction": "the common walls are parallel: the maps could slide along them",
     "looks like another place of the same kind": "such walls stand in many places of such a building: more map will tell",
     "second best as good": "there is a second place that fits as well: the building repeats itself, more map will tell",
-    "second best not ruled out": "there is a second place that is not ruled out yet: more map will tell",
 }
 STYLE = """
 :root{color-scheme:light dark;--ink:#222;--faint:#666;--paper:#fff;--line:#ddd;--good:#1a7f37;--maybe:#9a6700;--bad:#b42318}
