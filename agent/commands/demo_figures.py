@@ -15,6 +15,7 @@ from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 STEPS = ((0.05, math.radians(0.5)), (0.01, math.radians(0.1)), (0.002, math.radians(0.02)))  # metres, radians: coarse to fine
 ROUNDS = 12  # of one step of the search each
+ALL_TOLD = 6  # of more than these the closing sentence says the least and the most
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,16 +42,28 @@ class Figures:
         if not self.are_all_merged:
             which = f"only {', '.join(self.merged)}" if len(self.merged) > 1 else "none"
             return f"not merged: of {len(self.robots)} robots {which} found out how their maps fit"
-        factors = f"match factors {', '.join(f'{f:.3f}' for f in sorted(self.match_factors, reverse=True))}"
         when = f" after {self.seconds_to_merge:.1f} s" if self.seconds_to_merge is not None else ""
-        parts = [f"{len(self.merged)} robots merged into one map of {self.known_m2:.0f} m²{when} ({factors})"]
+        parts = [f"{len(self.merged)} robots merged into one map of {self.known_m2:.0f} m²{when} ({self._factors()})"]
         if self.agreement is not None:
             parts.append(f"{self.agreement:.1%} of its cells agree with the simulated world")
         if self.pose_errors_m:
-            errors = (f"{robot} {error * 100:.1f} cm" for robot, error in sorted(self.pose_errors_m.items()))
-            parts.append(f"pose errors {', '.join(errors)}")
+            parts.append(self._pose_errors())
         parts.append(f"{self.conflicting_cells} cells conflict and are unknown")
         return "; ".join(parts)
+
+    def _factors(self) -> str:
+        factors = sorted(self.match_factors, reverse=True)
+        if len(factors) <= ALL_TOLD:
+            return f"match factors {', '.join(f'{factor:.3f}' for factor in factors)}"
+        return f"{len(factors)} match factors from {factors[-1]:.3f} to {factors[0]:.3f}"
+
+    def _pose_errors(self) -> str:
+        errors = sorted(self.pose_errors_m.items())
+        if len(errors) <= ALL_TOLD:
+            return f"pose errors {', '.join(f'{robot} {error * 100:.1f} cm' for robot, error in errors)}"
+        robot, worst_m = max(errors, key=lambda entry: entry[1])
+        middle_m = float(np.median([error for _, error in errors]))
+        return f"pose errors {100 * middle_m:.1f} cm in the middle, at most {100 * worst_m:.1f} cm ({robot})"
 
 
 def aligned(fused: OccupancyGrid, truth: OccupancyGrid, T_world_global: SE2) -> SE2:

@@ -25,6 +25,7 @@ from protocol.grid import OccupancyGrid
 REPLAY_SPEED = 8.0  # a recording of half an hour in a minute: scans come at about 9 Hz
 REPLAY_V_MAX_MPS = 50
 MERGE_WITHIN_S = 50.0
+FEW_ROBOTS, MERGE_S_A_ROBOT = 6, 6.0  # more of them share a computer's cores and meet later: 20 on two cores after 100 s
 TICK_PER_ROBOT_S = (
     0.0025  # bytes of many robots move in larger portions: every 50 ms costs 1.9 % of a core each, every 10 ms 5.1 %
 )
@@ -116,8 +117,8 @@ class SimulatedStage:
         return None
 
     def time_limit_s(self) -> float:
-        """Long enough for any two rooms' worth of map to meet, short enough for the demo to end within a minute."""
-        return MERGE_WITHIN_S
+        """Long enough for any two rooms' worth of map to meet; with a few robots the demo ends within a minute."""
+        return MERGE_WITHIN_S + MERGE_S_A_ROBOT * max(0, len(self.robots) - FEW_ROBOTS)
 
     def truth(self) -> OccupancyGrid | None:
         """See `Stage`."""
