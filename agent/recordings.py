@@ -12,6 +12,7 @@ from pathlib import Path
 
 from hw.carmen import RecordedScan, read_recording
 from hw.errors import DeviceConfigError
+from hw.log_files import refuse_endless
 from hw.readings import LaserScan, Odometry
 from hw.recorder import MAGIC
 from protocol.geometry import SE2
@@ -31,6 +32,7 @@ class Readings:
     readings: Sequence[LaserScan | Odometry]
     first_stamp_s: float = 0.0
     T_base_laser: SE2 | None = None  # where the LIDAR sat, when the recording says
+    odometry: str = ""  # where in the recording it was found
 
     @property
     def scans(self) -> int:
@@ -39,10 +41,13 @@ class Readings:
 
 def open_recording(path: Path, scan_topic: str | None = None, odometry_topic: str | None = None) -> Readings:
     """By what the file is; RecordingError when it is none of those."""
-    if not path.exists():
-        raise RecordingError(f"{path}: no such recording")
     if path.is_dir() and not (path / "metadata.yaml").is_file():
         raise RecordingError(f"{path}: a folder without metadata.yaml; is this a rosbag2 recording?")
+    try:
+        if not path.is_dir():
+            refuse_endless(path)
+    except DeviceConfigError as error:
+        raise RecordingError(str(error)) from error
     if path.is_dir() or path.suffix in (".mcap", ".db3", ".bag"):
         from agent.rosbags_reader import read_bag  # noqa: PLC0415  an optional package
 
@@ -60,7 +65,8 @@ def open_recording(path: Path, scan_topic: str | None = None, odometry_topic: st
         recording = read_recording(path)
     except DeviceConfigError as error:
         raise RecordingError(str(error)) from error
-    return in_order(Readings(recording.name, list(carmen_readings(recording.scans))))
+    readings = carmen_readings(recording.scans) if recording.has_odometry else (scan.laser_scan() for scan in recording.scans)
+    return in_order(Readings(recording.name, list(readings), T_base_laser=recording.T_base_laser, odometry=recording.odometry))
 
 
 def carmen_readings(scans: Iterable[RecordedScan]) -> Iterator[LaserScan | Odometry]:

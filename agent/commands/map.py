@@ -77,12 +77,19 @@ def run(args: argparse.Namespace) -> int:
         raise CommandError(
             f"{args.log}: {drawn.scans} scans, and not one could be drawn; is the LIDAR's range in metres?", BAD_INPUT
         )
+    if drawn.begun_anew and not any(isinstance(reading, Odometry) for reading in recording.readings):
+        raise CommandError(
+            f"{args.log}: no raw odometry in it, and its scans are too far apart to follow without: lost {drawn.begun_anew} times"
+            f" in {drawn.scans} scans; nothing is written",
+            BAD_INPUT,
+        )
     base = args.output or Path(recording.name)
     written = write(base, recording, drawn)
     figures = as_json(recording, drawn)
     print(json.dumps(figures) if args.json else as_text(figures))
     if not args.quiet:
-        print("\n".join(f"wrote {path}" for path in written), file=sys.stderr)
+        told = [f"odometry: {recording.odometry}"] if recording.odometry else []
+        print("\n".join([*told, *(f"wrote {path}" for path in written)]), file=sys.stderr)
     return OK if drawn.estimate.grid.known_area_m2() > 0 else NEGATIVE
 
 
@@ -128,6 +135,7 @@ def as_json(recording: Readings, drawn: Drawn) -> dict[str, float | str]:
     grid, path = drawn.estimate.grid, drawn.trajectory
     return {
         "log": recording.name,
+        "odometry": recording.odometry,
         "scans": drawn.scans,
         "scans_placed": len(path),
         "duration_s": round(float(path[-1, 0] - path[0, 0]), 2),

@@ -59,7 +59,7 @@ class Replay:
         now_s, rolled = STILL_S, np.zeros(2)
         for i, scan in enumerate(self.recording.scans):
             if i > 0:
-                for duration_s, step in phases(scan.motion or SE2.identity(), speed):
+                for duration_s, step in phases(self.recording.laser_motion(scan), speed):
                     now_s, rolled = now_s + duration_s, rolled + step
                     self._event(now_s, rolled)
                 if scan.motion is None:

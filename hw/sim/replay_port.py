@@ -25,7 +25,10 @@ def open_part(path: str, part: str) -> Recording:
     index, slash, count = part.partition("/")
     if not (slash and index.isdigit() and count.isdigit() and int(count)):
         raise DeviceConfigError(f"{path}: part={part}; write it as 1/2, the first of two")
-    return read_recording(path).part(int(index), int(count))
+    recording = read_recording(path)
+    if not recording.has_odometry:
+        raise DeviceConfigError(f"{path}: no raw odometry in it, so it makes no wheels; try mapquilt map {path}")
+    return recording.part(int(index), int(count))
 
 
 def _open_replay(url: DeviceUrl, kind: str) -> Device:

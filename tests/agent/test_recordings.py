@@ -25,9 +25,12 @@ CARMEN = """\
 PARAM robot_frontlaser_offset 0.0
 ODOM 0 0 0 0 0 0 0.0 host 0.0
 FLASER 4 1.0 2.0 3.0 80.0 0 0 0 0 0 0 10.0 host 10.0
+ODOM 0 0 0 0 0 0 0 host 0
 ODOM 0.5 0 0.1 0 0 0 10.4 host 10.4
-FLASER 4 1.1 2.1 3.1 4.1 0.45 0 0.09 0.5 0 0.1 10.5 host 10.5
-FLASER 4 1.1 2.1 3.1 4.1 0.45 0 0.09 0.5 0 0.1 10.4 host 10.4
+FLASER 4 1.1 2.1 3.1 4.1 0.45 0 0.09 0.45 0 0.09 10.5 host 10.5
+ODOM 0.45 0 0.09 0 0 0 0 host 0
+FLASER 4 1.1 2.1 3.1 4.1 0.85 0 0.09 0.85 0 0.09 10.4 host 10.4
+FLASER 4 1.1 2.1 3.1 4.1 0.95 0 0.09 0.95 0 0.09 10.4 host 10.4
 """
 
 
@@ -36,12 +39,11 @@ def test_a_carmen_log_gives_odometry_before_every_scan(tmp_path: Path) -> None:
     log.write_bytes(gzip.compress(CARMEN.encode()))
     recording = open_recording(log)
     assert recording.name == "run"
-    assert [type(reading) for reading in recording.readings] == [Odometry, LaserScan] * 3
+    assert [type(reading) for reading in recording.readings] == [Odometry, LaserScan, Odometry] + [Odometry, LaserScan] * 3
     stamps = [reading.stamp_s for reading in recording.readings]
     assert stamps == sorted(stamps)
-    moved, unknown = recording.readings[2], recording.readings[4]
-    assert isinstance(moved, Odometry)
-    assert isinstance(unknown, Odometry)
+    odometry = [reading for reading in recording.readings if isinstance(reading, Odometry)]
+    moved, unknown = odometry[2], odometry[-1]
     assert (moved.x_m, moved.theta_rad, moved.is_discontinuity) == (0.5, 0.1, False)
     assert unknown.is_discontinuity  # no ODOM between the last two scans: how the robot moved is not known
 
