@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from agent.runtime.control import ControlError, ask
-from agent.runtime.keeper import unpacked_map
+from agent.runtime.packed_maps import unpacked_map
 from protocol.grid import OccupancyGrid
 
 READY_WITHIN_S = 30.0

@@ -24,7 +24,7 @@ from agent.mcap_file import McapFile
 from agent.ros_frames import base_frame, map_frame
 from agent.ros_messages import OCCUPANCY_GRID, PATH, TF, occupancy_grid, path, transforms
 from agent.running import ask_robot, robot_socket, running_robots
-from agent.runtime.keeper import unpacked_map
+from agent.runtime.packed_maps import unpacked_map
 from agent.runtime.settings import mapping_options
 from agent.runtime.snapshot import GLOBAL
 from agent.runtime.state import StateDirectory

@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
 
 def running_map(robot: str | None) -> tuple[Any, SE2 | None, str]:
     """The own map of the running robot, its pose in it, and its name."""
-    from agent.runtime.keeper import unpacked_map  # noqa: PLC0415  only this path needs the runtime
+    from agent.runtime.packed_maps import unpacked_map  # noqa: PLC0415  only this path needs the runtime
 
     name, socket = robot_socket(robot)
     status = ask_robot(socket, "status")["status"]

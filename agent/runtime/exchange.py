@@ -73,10 +73,14 @@ class Exchange:
     def is_open(self) -> bool:
         return self._session is not None
 
-    def close(self) -> None:
-        """Leave the network.  Never raises, never waits more than Zenoh's own 10 s."""
+    def stop_waiting(self) -> None:
+        """Whoever waits for an answer or a message goes on without one; nothing new is asked."""
         self.closed.set()
         self.inbox.wake()
+
+    def close(self) -> None:
+        """Leave the network.  Never raises, never waits more than Zenoh's own 10 s."""
+        self.stop_waiting()
         with self._swap:
             self._close_session()
         self._answering.join()

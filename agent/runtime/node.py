@@ -38,6 +38,7 @@ from agent.runtime.health import Health, Notifier, watchdog_period_s
 from agent.runtime.keeper import Keeper
 from agent.runtime.map_worker import MapWorker
 from agent.runtime.merge_worker import MergeWorker
+from agent.runtime.orders import Orders
 from agent.runtime.own_loops import fit_in_own_map
 from agent.runtime.pace import REAL, Pace
 from agent.runtime.priors import FrozenPeer
@@ -95,7 +96,7 @@ class Node:
         self.keeper = Keeper(self)
         self.workers = self._workers()
         self.health = Health(self.reports, Notifier())
-        self.control = ControlServer(control_socket, self.keeper.commands()) if control_socket is not None else None
+        self.control = ControlServer(control_socket, Orders(self).commands()) if control_socket is not None else None
         self.stopping = threading.Event()
 
     def _workers(self) -> list[Worker]:
@@ -184,12 +185,14 @@ class Node:
         started = time.monotonic()
         for worker in self.workers:
             worker.ask_to_stop()
+        for fleet in (self.fleet, *(prior.fleet for prior in self.priors)):
+            fleet.exchange.stop_waiting()
         if self.control is not None:
             self.control.close()
-        for worker in reversed(self.workers):
-            if not worker.join(STOP_WITHIN_S - (time.monotonic() - started)):
-                log.warning("worker=%s does not stop, left behind", worker.name)
-        self.keeper.save_now()
+        left = [w.name for w in reversed(self.workers) if not w.join(STOP_WITHIN_S - (time.monotonic() - started))]
+        for name in left:
+            log.warning("worker=%s does not stop, left behind", name)
+        self.keeper.save_now(is_map_at_rest="map" not in left)
         for device in (self.lidar, self.wheels):
             if device is not None:
                 device.stop()

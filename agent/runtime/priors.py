@@ -45,23 +45,23 @@ class FrozenPeer:
         self._settings = replace(settings, robot=self.name, holder=settings.robot, listen=(), is_router=False)
         boot_id = secrets.randbits(63)
         coordinator = Coordinator(self.name, boot_id, replace(options, is_frozen=True))
-        self._fleet = FleetWorker(coordinator, self._settings, merger, guard_for(self._settings, boot_id))
+        self.fleet = FleetWorker(coordinator, self._settings, merger, guard_for(self._settings, boot_id))
 
     def workers(self) -> list[Worker]:
         """Rows for the node's table."""
         return [
-            Worker(f"{self.name}", self._fleet.step, 5.0, "messages, results, time", "messages, jobs"),
-            Worker(f"{self.name}-bulk", self._fleet.bulk_step, 60.0, "fetches", "pulled messages"),
-            Worker(f"{self.name}-small", self._fleet.small_step, 60.0, "fetches", "pulled messages"),
+            Worker(f"{self.name}", self.fleet.step, 5.0, "messages, results, time", "messages, jobs"),
+            Worker(f"{self.name}-bulk", self.fleet.bulk_step, 60.0, "fetches", "pulled messages"),
+            Worker(f"{self.name}-small", self.fleet.small_step, 60.0, "fetches", "pulled messages"),
         ]
 
     def open(self, locators: tuple[str, ...]) -> None:
         """Join the fleet by dialling our own robot, or its router."""
-        exchange = self._fleet.exchange
+        exchange = self.fleet.exchange
         if self._settings.mode != "client":
             exchange.settings = replace(exchange.settings, connect=locators)
         exchange.open()
-        self._fleet.local_maps.put((GivenMap(self._grid), MapSnapshot.of(self._grid).features))
+        self.fleet.local_maps.put((GivenMap(self._grid), MapSnapshot.of(self._grid).features))
 
     def close(self) -> None:
-        self._fleet.exchange.close()
+        self.fleet.exchange.close()

@@ -13,7 +13,7 @@ import pytest
 from agent.cli import main
 from agent.map_files import save_map
 from agent.runtime.control import ControlError, ControlServer
-from agent.runtime.keeper import packed_map
+from agent.runtime.packed_maps import packed_map
 from protocol.geometry import SE2
 from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
