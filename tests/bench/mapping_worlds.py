@@ -31,8 +31,6 @@ from protocol.grid import FREE, OCCUPIED, OccupancyGrid
 from tests.bench.mapping_drives import VARIATIONS, Revolution, explore, world_of
 from tests.bench.tables import heading, line
 
-BAR_M, BAR_DEG, BAR_CELLS, BAR_CPU = 0.05, 0.5, 0.99, 0.25
-
 
 def feed(mapper: Mapper, revolution: Revolution) -> tuple[ScanOutcome, float]:
     """One turn into the filter; what came of it and the CPU seconds it took."""

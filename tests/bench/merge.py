@@ -21,10 +21,10 @@ from typing import Any
 
 import numpy as np
 
+from tests.bench.recordings import SHARED
 from tests.bench.tables import markdown
 
 REPO = Path(__file__).resolve().parents[2]
-SHARED = Path(os.environ.get("MAPQUILT_SHARED", REPO.parent / "shared"))
 OURS = {
     "mapquilt": "agent.merging.adapter:merge",
     "paper": "agent.merging.adapter:merge_like_the_paper",

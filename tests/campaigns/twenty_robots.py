@@ -43,8 +43,7 @@ def campaign(args: argparse.Namespace) -> dict[str, Any]:
             print(f"up: {actor.name}", file=sys.stderr)
         fleet.begin(stage)
         started = time.monotonic()
-        names, merged_s, agreed_s, most, rss_mb = [actor.name for actor in stage.robots], None, None, 0, 0.0
-        digests: Counter[str | None] = Counter()
+        names, merged_s, most, rss_mb = [actor.name for actor in stage.robots], None, 0, 0.0
         while merged_s is None and time.monotonic() - started < 60 * args.minutes:
             held = [len(fleet.members(name)) for name in names]
             members = max(held)

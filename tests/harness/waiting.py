@@ -19,7 +19,7 @@ def first_reading(device: Source, is_wanted: Callable[[Any], bool], seconds: flo
     raise AssertionError(f"no such reading within {seconds} s: {device.health()}")
 
 
-def until(holds: Callable[[], bool], seconds: float, what: str = "it") -> float:
+def until(holds: Callable[[], object], seconds: float = 15.0, what: str = "it") -> float:
     """Seconds until `holds()`; an AssertionError when it does not in time."""
     begun_s = time.monotonic()
     while not holds():

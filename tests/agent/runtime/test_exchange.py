@@ -8,7 +8,7 @@ import sys
 import textwrap
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -19,15 +19,9 @@ from agent.runtime.exchange import Exchange, ExchangeError
 from agent.runtime.network import NetworkSettings
 from agent.runtime.pending import NoSuchRegister
 from agent.runtime.traffic import MAX_PAYLOAD_BYTES
+from tests.harness.waiting import until
 
 ROOT = Path(__file__).resolve().parents[3]
-
-
-def until(condition: Callable[[], object], within_s: float = 10.0) -> None:
-    deadline_s = time.monotonic() + within_s
-    while not condition():
-        assert time.monotonic() < deadline_s, "the condition did not come true in time"
-        time.sleep(0.01)
 
 
 def nothing(_: str) -> bytes | None:
@@ -105,7 +99,7 @@ def test_a_reader_that_never_reads_does_not_freeze_its_peer(hub: Exchange) -> No
         until(leaf.links)
         for number in range(2000):
             leaf.put(f"t/k{number % 500}/beat", bytes(4000))
-        until(lambda: leaf.receive(leaf.ask("t/hub/x")) == b"t/hub/x", within_s=20.0)  # a burst may drop the query itself
+        until(lambda: leaf.receive(leaf.ask("t/hub/x")) == b"t/hub/x", 20.0)  # a burst may drop the query itself
         assert len(hub.inbox) <= 1024
 
 

@@ -20,8 +20,8 @@ from agent.runtime.worker import Worker
 from protocol.channels import robot_key
 from protocol.geometry import SE2
 from protocol.grid import OccupancyGrid
-from tests.agent.runtime.test_exchange import until
 from tests.harness.floorplans import office
+from tests.harness.waiting import until
 
 FLEET = "test-fleet-worker"
 

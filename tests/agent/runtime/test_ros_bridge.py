@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from typing import Any
 
@@ -20,6 +20,7 @@ from agent.runtime.ros_bridge import RosBridge, domain_of
 from agent.xxh3 import xxh3_128
 from protocol.geometry import SE2
 from protocol.grid import OccupancyGrid
+from tests.harness.waiting import until
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 GRID, TF = "nav_msgs/msg/OccupancyGrid", "tf2_msgs/msg/TFMessage"
@@ -46,13 +47,6 @@ class Fleet:
 def session(mode: str, **more: Any) -> Any:
     config = {"mode": mode, "scouting": {"multicast": {"enabled": False}, "delay": 0}, "timestamping": {"enabled": True}, **more}
     return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
-
-
-def until(condition: Callable[[], object], within_s: float = 15.0) -> None:
-    deadline_s = time.monotonic() + within_s
-    while not condition():
-        assert time.monotonic() < deadline_s, "the condition did not come true in time"
-        time.sleep(0.01)
 
 
 @pytest.fixture

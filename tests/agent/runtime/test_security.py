@@ -23,7 +23,8 @@ from protocol.channels import robot_key, subscriptions
 from protocol.codec import decode
 from protocol.errors import RemoteProtocolError
 from protocol.grid import OccupancyGrid
-from tests.agent.runtime.test_exchange import nothing, until
+from tests.agent.runtime.test_exchange import nothing
+from tests.harness.waiting import until
 
 FLEET = "secure"
 

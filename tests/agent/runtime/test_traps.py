@@ -26,8 +26,9 @@ from protocol.codec import encode
 from protocol.geometry import SE2
 from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from protocol.messages import Beat, Chunk, CoarseMap, Manifest, MapVersion
-from tests.agent.runtime.test_exchange import nothing, until
+from tests.agent.runtime.test_exchange import nothing
 from tests.harness.network import Network
+from tests.harness.waiting import until
 from tests.protocol.examples import BOOT, examples
 
 ROOT = Path(__file__).resolve().parents[3]

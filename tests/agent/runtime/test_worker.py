@@ -8,13 +8,14 @@ import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from agent.runtime.health import Health, Notifier
 from agent.runtime.sensing import MAX_SCANS_WAITING, Readings
 from agent.runtime.worker import Worker
 from hw.readings import LaserScan, Odometry
-from tests.agent.runtime.test_exchange import until
+from tests.harness.waiting import until
 
 
 def test_an_exception_is_counted_and_the_worker_goes_on(caplog: pytest.LogCaptureFixture) -> None:
@@ -67,8 +68,6 @@ def test_a_worker_that_does_not_come_back_is_stuck_and_the_watchdog_hungry(tmp_p
 
 
 def scan(stamp_s: float) -> LaserScan:
-    import numpy as np  # noqa: PLC0415
-
     return LaserScan(stamp_s, np.ones(4, np.float32), np.zeros(4, np.float32), 0.1, 10.0, duration_s=0.1)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -14,7 +14,7 @@ from agent.view.server import ViewServer
 from protocol.features import FeatureMap
 from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from tests.harness.browser import Browser, chromium
-from tests.harness.waiting import until as wait_until
+from tests.harness.waiting import until
 
 pytestmark = pytest.mark.skipif(chromium() is None, reason="no chromium on this machine: apt install chromium")
 
@@ -95,10 +95,6 @@ def server(fleet: Fleet) -> Iterator[ViewServer]:
     running.start()
     yield running
     running.close()
-
-
-def until(holds: Callable[[], bool]) -> None:
-    wait_until(holds, 15.0)
 
 
 def show(browser: Browser, server: ViewServer) -> None:
