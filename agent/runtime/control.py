@@ -37,6 +37,7 @@ class ControlServer:
         self.path, self._handlers = path, handlers
         self._closed = threading.Event()
         self._socket: socket.socket | None = None
+        self._client: socket.socket | None = None  # who is being answered
         self._thread = threading.Thread(target=self._serve, name="control", daemon=True)
 
     def start(self) -> None:
@@ -77,6 +78,9 @@ class ControlServer:
 
     def close(self) -> None:
         self._closed.set()
+        if self._client is not None:
+            with contextlib.suppress(OSError):  # it may be gone
+                self._client.shutdown(socket.SHUT_RD)  # who says nothing is not waited for; an answer still goes out
         if self._thread.is_alive():
             self._thread.join(CLIENT_TIMEOUT_S + 0.5)
         if self._socket is not None:
@@ -95,6 +99,7 @@ class ControlServer:
                 log.debug("control: %s", error)
                 self._closed.wait(ACCEPT_AGAIN_S)
                 continue
+            self._client = client
             with client:
                 try:
                     client.settimeout(CLIENT_TIMEOUT_S)

@@ -5,13 +5,15 @@ from __future__ import annotations
 import contextlib
 import socket
 import stat
+import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from agent.runtime.control import ControlError, ControlServer, ask
+from agent.runtime.control import CLIENT_TIMEOUT_S, ControlError, ControlServer, ask
+from tests.harness.waiting import until
 
 
 @pytest.fixture
@@ -74,6 +76,15 @@ def test_a_socket_left_by_a_crash_is_taken_over(tmp_path: Path) -> None:
     assert ask(path, "status")["ok"]
     server.close()
     assert not path.exists()
+
+
+def test_a_client_that_says_nothing_does_not_hold_up_the_end(server: ControlServer) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as silent:
+        silent.connect(str(server.path))
+        until(lambda: server._client is not None)
+        started_s = time.monotonic()
+        server.close()
+        assert time.monotonic() - started_s < 0.5 * CLIENT_TIMEOUT_S
 
 
 def test_no_agent_is_one_clear_sentence(tmp_path: Path) -> None:
