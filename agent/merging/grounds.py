@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.features.snapshot import MapSnapshot
+from agent.merging.doubts import doubts, turning
 from agent.merging.result import MatchFactor
 from agent.merging.transforms import Poses
-from agent.merging.validation import doubts, evidence, match_factor, turning
+from agent.merging.validation import evidence, match_factor
 from agent.merging.verdict import Grounds, rival_score
 from agent.merging.views import witness
 

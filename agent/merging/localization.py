@@ -44,7 +44,7 @@ def for_local_maps(options: MatchOptions) -> MatchOptions:
         min_agreeing_m=min(options.min_agreeing_m, LOCAL_AGREEING_M),
         max_rival_share=max(options.max_rival_share, LOCAL_RIVAL_SHARE),
         near_rival_share=max(options.near_rival_share, LOCAL_RIVAL_SHARE),  # every other place of the given map is looked at
-        round_rival_share=max(options.round_rival_share, LOCAL_RIVAL_SHARE),
+        some_rival_share=max(options.some_rival_share, LOCAL_RIVAL_SHARE),
         min_observability_m=min(options.min_observability_m, LOCAL_OBSERVABILITY_M),
         min_observable_share=min(options.min_observable_share, LOCAL_OBSERVABLE_SHARE),
         unsuspicious=min(options.unsuspicious, LOCAL_UNSUSPICIOUS),

@@ -62,8 +62,8 @@ class MatchOptions:
     min_margin_m: float = 6.5  # metres of wall by which the best must beat the best distinct alternative; 8 costs 5 % of merges
     min_agreeing_m: float = 8.0  # of firm wall
     max_rival_share: float = 0.72  # of the best score
-    near_rival_share: float = 0.45  # above it the building may repeat itself: what merges then has no flaw
-    round_rival_share: float = 0.25  # above it, what says little about how the maps are turned must be far ahead
+    near_rival_share: float = 0.35  # above it the building may repeat itself: what merges then has no flaw
+    some_rival_share: float = 0.15  # above it, the maps must agree in what tells places apart
     min_observability_m: float = 2.0  # of wall that fixes the worst-seen direction, and
     min_observable_share: float = 0.1  # of agreeing wall: along a long corridor two metres of cross wall are an accident
     unsuspicious: float = 0.3  # most true pairs look less like another place of the same kind; above it more margin is asked for

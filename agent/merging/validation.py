@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import cv2
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.features.field import MatchField
-from agent.features.structure import ATTACHED, LOOSE, SHORT
+from agent.features.structure import LOOSE
 from agent.features.wall_points import SPACING_M, WallPoints
 from agent.features.working import WorkingGrid
 from agent.merging.result import MatchFactor
@@ -20,9 +19,7 @@ from agent.merging.scoring import (
     CROSSES,
     Probe,
     Worths,
-    looked_up,
     outcome_table,
-    placed,
     readings,
 )
 from agent.merging.transforms import Poses, inverted
@@ -34,9 +31,6 @@ DECISION_WORTH: Worths = (
     (1.0, -1.6, -0.9, -0.5),  # short
     (0.65, -1.9, -1.2, -0.5),  # long
 )
-
-FAR_OFF = 1e-3  # of the wall: a point so far off that turning about it is sliding does not count as one
-DEEP_M = 0.45  # a wall this far from any of theirs, in their free space, is no misalignment
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,48 +73,6 @@ def _one_way(points: Witness, on: Witness, poses: Poses) -> tuple[NDArray[np.flo
     against = ((outcome == CONFLICTS) | (outcome == CROSSES)).astype(np.float32) @ firm
     sums = worth.sum(axis=1), (worth * hits).sum(axis=1), hits @ firm, against, smallest
     return tuple(np.asarray(v, np.float64) * SPACING_M for v in sums)
-
-
-def doubts(ours: Witness, theirs: Witness, pose: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Signs of another place of the same kind.
-
-    Attached wall that conflicts and straight wall deep in free space, per metre that agrees; then metres of agreeing wall
-    that is not long.
-    """
-    attached, deep, distinct, agreeing = np.zeros(2), 0.0, 0.0, 0.0
-    for points, on, T in ((theirs, ours, pose[None]), (ours, theirs, inverted(pose[None]))):
-        outcome = OUTCOMES.take(readings(on.field.fine, on.field.resolution_m, points.probe, T))[0]
-        clutter = points.kinds == ATTACHED
-        attached += [np.count_nonzero(clutter & (outcome == what)) for what in (CONFLICTS, AGREES)]
-        agrees = outcome == AGREES
-        agreeing += np.count_nonzero((points.kinds != LOOSE) & agrees)
-        distinct += np.count_nonzero(((points.kinds == ATTACHED) | (points.kinds == SHORT)) & agrees)
-        alone = (points.kinds >= SHORT) & (outcome == CONFLICTS)
-        x, y = placed(points.probe.xy1[:, alone], T, on.field.resolution_m)
-        away = looked_up(on.field.distance_m, x, y, outside=0)
-        deep += np.count_nonzero(away > DEEP_M)
-    agreeing = max(agreeing, 0.5)
-    return float(attached[0] / max(attached[1], 0.5)), float(deep / agreeing), 0.5 * SPACING_M * float(distinct)
-
-
-def turning(ours: Witness, theirs: Witness, pose: NDArray[np.float64]) -> float:
-    """Metres of agreeing wall that say how the maps are turned, about whichever point says least; the worse direction.
-
-    A round hall agrees with itself however it is turned about its middle.  Each point counts by how much of its way, were
-    the map turned about that point, is along its normal.
-    """
-    least = math.inf
-    for points, on, T in ((theirs, ours, pose[None]), (ours, theirs, inverted(pose[None]))):
-        agrees = OUTCOMES.take(readings(on.field.fine, on.field.resolution_m, points.probe, T))[0] == AGREES
-        n, at = (values[agrees].astype(np.float64) for values in (points.thin.normals, points.thin.positions_m))
-        if not len(n):
-            return 0.0
-        at -= at.mean(axis=0)
-        swept = at[:, 0] * n[:, 1] - at[:, 1] * n[:, 0]  # along the normals, turned about the middle
-        moved = -np.linalg.solve(n.T @ n + FAR_OFF * len(n) * np.eye(2), n.T @ swept)  # and what undoes most of that
-        way = moved @ moved + np.mean(np.sum(at**2, axis=1)) + 1e-9
-        least = min(least, SPACING_M * float(np.sum((swept + n @ moved) ** 2) / way))
-    return least
 
 
 def match_factor(ours: WorkingGrid, theirs: WorkingGrid, pose: NDArray[np.float64]) -> tuple[MatchFactor, float]:

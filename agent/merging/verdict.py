@@ -28,7 +28,13 @@ GRAVE_SUSPICION = 0.8  # few true pairs look worse, and those that do are far ah
 MARGIN_PER_GRAVE_SUSPICION_M = 45.0  # mirrored parts of a building at 1.2 were ahead by 20 m
 MIN_DISTINCT_M = 4.0  # two ends of a building share long walls; what tells them apart is short,
 CLEAR_MARGIN_M = 25.0  # unless nothing else comes near: ends that were merged wrongly were ahead by 7 to 13 m
-FLAW = 0.002  # of `deep_doubt`: more than none
+FLAWED_SHARE, FLAW = 0.45, 0.002  # a rival of this share of the score, and of `deep_doubt` more than none
+ODD_M = 1.5  # in the middle of free space, where
+INDOOR_SHARE = 0.5  # of what agrees is more than there is of loose things; in the open these come and go
+DEEP_ALONE = 2.0  # doubt per root of `deep_doubt`; true pairs keep their margins up to 2.2
+STRETCH_M, STRETCH_SHARE = 3.0, 0.06  # of one wall in the open: true pairs reach 0.065 of what agrees among cars,
+STRETCH_PER_ASTRAY = 0.25  # and 0.105 among plants, where things astray tell that little fits better
+STRANGE_M, FAMILIAR_M = 1.0, 1.0  # things that stand elsewhere, and things that stand where they should
 ROUND_M = 16.0  # so much wall, of which
 ROUND_SHARE = 0.28  # less than this says how the maps are turned, is a round hall or racking: its ends merged up to 0.27
 REPEATED_SHARE, REPEATED_M = 0.6, 24.0  # a rival of this share of the score and so much wall is no accident
@@ -49,6 +55,9 @@ class Grounds:
     attached_doubt: float
     deep_doubt: float
     distinct_m: float  # agreeing wall that is no long wall
+    stretch_m: float  # the most of one long wall that stands deep in the other map's free space
+    loose_m: float  # free-standing things that agree,
+    astray_m: float  # and those deep in the other map's free space
     turning_m: float  # agreeing wall that says how the maps are turned
 
     @property
@@ -90,9 +99,15 @@ def verdict(grounds: Grounds, options: MatchOptions) -> tuple[MatchStatus, str]:
         return MatchStatus.AMBIGUOUS, Reason.RIVAL
     is_bare = g.distinct_m < MIN_DISTINCT_M and g.score - g.rival < CLEAR_MARGIN_M
     grave_m = options.min_margin_m + MARGIN_PER_GRAVE_SUSPICION_M * (g.suspicion - GRAVE_SUSPICION)
-    if g.is_refuted or is_bare or g.score - g.rival <= grave_m or _is_one_of_many(g, options) or _is_round(g, options):
+    is_doubtful = g.is_refuted or is_bare or g.score - g.rival <= grave_m or _is_crossed(g)
+    if is_doubtful or _is_one_of_many(g, options) or _is_one_of_a_few(g, options):
         return MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE
     return MatchStatus.MERGED, Reason.MATCHED
+
+
+def _is_crossed(g: Grounds) -> bool:
+    """Whether a wall of one map crosses the other's free space, longer than a door: two warehouses with the same racks."""
+    return g.stretch_m > max(STRETCH_M, STRETCH_SHARE * g.agreeing_m + STRETCH_PER_ASTRAY * g.astray_m)
 
 
 def _is_one_of_many(g: Grounds, options: MatchOptions) -> bool:
@@ -101,31 +116,37 @@ def _is_one_of_many(g: Grounds, options: MatchOptions) -> bool:
     Two ends of a hotel with one kind of room fit over fifty metres of wall, shifted by a room nearly as well.  A true overlap
     with a rival so near is flawless, as a rule; a wrong one has some furniture in the middle of the other map's free space.
     """
-    share = g.rival / g.score
+    share, is_clear = g.rival / g.score, g.score - g.rival > CLEAR_MARGIN_M
     if share <= options.near_rival_share:
         return False
-    return g.deep_doubt > FLAW or (share > REPEATED_SHARE and g.rival > REPEATED_M)
+    is_indoors = g.loose_m + g.astray_m < INDOOR_SHARE * g.agreeing_m
+    is_odd = is_indoors and g.astray_m + g.deep_doubt * g.agreeing_m > ODD_M and not is_clear
+    return is_odd or (share > FLAWED_SHARE and g.deep_doubt > FLAW) or (share > REPEATED_SHARE and g.rival > REPEATED_M)
 
 
-def _is_round(g: Grounds, options: MatchOptions) -> bool:
-    """Whether the maps may as well be turned about some place, and nearly are in another hypothesis.
+def _is_one_of_a_few(g: Grounds, options: MatchOptions) -> bool:
+    """Whether there is some other place, and what would tell it from this one does not agree.
 
-    Two ends of a rotunda agree along its round walls, and walls between its rooms fall on each other by accident.
+    Two ends of a rotunda agree along its round walls, however they are turned, and walls between its rooms fall on each other
+    by accident.  Two of its rooms agree in every wall, and in nothing that stands in them.
     """
-    if g.agreeing_m < ROUND_M or g.turning_m > ROUND_SHARE * g.agreeing_m:
+    if g.rival <= options.some_rival_share * g.score:
         return False
-    return g.rival > options.round_rival_share * g.score and g.score - g.rival < CLEAR_MARGIN_M
+    is_round = g.agreeing_m >= ROUND_M and g.turning_m <= ROUND_SHARE * g.agreeing_m and g.score - g.rival < CLEAR_MARGIN_M
+    return is_round or (g.astray_m > STRANGE_M and g.loose_m < FAMILIAR_M)
 
 
 def _needed_margin_m(g: Grounds, options: MatchOptions) -> float:
     """More the more it looks like another place of the same kind.
 
     Two ends of one building share long walls by design, and a few metres of cross wall by accident.  Where short walls and
-    clutter do not outweigh that accident, every doubt counts in full.
+    clutter do not outweigh that accident, every doubt counts in full, and a high match factor, which wide space has anywhere,
+    excuses no wall deep in it.
     """
     if g.distinct_m >= options.distinctive_m:
         return options.min_margin_m + MARGIN_PER_SUSPICION_M * max(0.0, g.suspicion - options.unsuspicious)
-    return options.min_margin_m + MARGIN_PER_BARE_SUSPICION_M * max(0.0, g.suspicion)
+    doubt = max(0.0, g.suspicion, DEEP_ALONE * math.sqrt(g.deep_doubt))
+    return options.min_margin_m + MARGIN_PER_BARE_SUSPICION_M * doubt
 
 
 def rival_score(poses: Poses, scores: NDArray[np.float64], best: int, around_m: NDArray[np.float64]) -> float:

@@ -1,4 +1,6 @@
-"""Buildings that repeat themselves, as a scanner sees parts of them: hotels of one kind of room, racking, rotundas.
+"""Buildings that repeat themselves, as a scanner sees parts of them.
+
+Hotels of one kind of room, racking, rotundas, garages, classrooms of one size, long halls between two rows of columns.
 
 Two parts of such a building without a place in common fit each other elsewhere nearly perfectly, and so do two of its kind.
 """
@@ -80,7 +82,56 @@ def rotunda(rng: np.random.Generator) -> World:
     return World.of("rotunda", shapes)
 
 
-KINDS: tuple[Callable[[np.random.Generator], World], ...] = (hotel, racking, rotunda)
+def garage(rng: np.random.Generator) -> World:
+    """Columns at equal distances along an aisle, cars of one size in two of five bays, and stairs at one end."""
+    count, pitch, depth = int(rng.integers(6, 9)), rng.uniform(4.8, 5.4), rng.uniform(4.8, 5.2)
+    aisle, column = rng.uniform(5.5, 6.5), rng.uniform(0.3, 0.6)
+    width, height = count * pitch, 2 * depth + aisle
+    shapes = [box(0.0, 0.0, width, height), box(0.0, depth, rng.uniform(1.5, 3.0), depth + rng.uniform(2.5, 4.0))]
+    for x in pitch * np.arange(1, count) - column / 2:
+        shapes += [box(x, y - column / 2, x + column, y + column / 2) for y in (depth, height - depth)]
+    for x in pitch / 2 * np.arange(2 * count):
+        for y in (0.4, height - 4.9):
+            if rng.random() < 0.4:
+                left, low = x + rng.uniform(0.2, 0.5), y + rng.uniform(-0.1, 0.3)
+                shapes.append(box(left, low, left + 1.75, low + 4.2))
+    return World.of("garage", shapes)
+
+
+def classrooms(rng: np.random.Generator) -> World:
+    """Rooms of one size along a corridor, the desks in rows that nobody measured, few missing; some have a cupboard."""
+    count, pitch, depth = int(rng.integers(4, 7)), rng.uniform(7.0, 9.0), rng.uniform(6.0, 7.5)
+    corridor, door = rng.uniform(2.0, 3.0), rng.uniform(0.4, 1.0)
+    width = count * pitch
+    doors = [(k * pitch + door, k * pitch + door + DOOR_M) for k in range(count)]
+    shapes = [box(0.0, 0.0, width, depth + corridor), wall_along_x(0.0, width, depth, doors)]
+    shapes += [wall_along_y(k * pitch, 0.0, depth, []) for k in range(1, count)]
+    for x in pitch * np.arange(count):
+        shapes.append(box(x + 0.8, depth - 3.5, x + 1.6, depth - 2.0))
+        if rng.random() < 0.7:
+            shapes.append(box(x + pitch - 0.6, 1.0, x + pitch - 0.1, 3.0))
+        for left in x + np.arange(3.0, pitch - 1.5, 1.9):
+            for y in np.arange(1.0, depth - 2.5, 1.7):
+                if rng.random() < 0.8:
+                    away, low = left + rng.uniform(-0.3, 0.3), y + rng.uniform(-0.3, 0.3)
+                    shapes.append(box(away, low, away + 1.3, low + 0.5))
+    return World.of("classrooms", shapes)
+
+
+def hall(rng: np.random.Generator) -> World:
+    """Two rows of columns at equal distances, and some benches."""
+    count, pitch, height = int(rng.integers(6, 9)), rng.uniform(3.5, 5.0), rng.uniform(9.0, 13.0)
+    width, aside, radius = (count + 1) * pitch, rng.uniform(1.5, 2.5), rng.uniform(0.25, 0.5)
+    shapes = [box(0.0, 0.0, width, height)]
+    for x in pitch * np.arange(1, count + 1):
+        shapes += [polygon(circle_points(x, y, radius)) for y in (aside, height - aside)]
+    for _ in range(rng.integers(5, 11)):
+        x, y = rng.uniform(1.0, width - 1.0), rng.uniform(1.0, height - 1.0)
+        shapes.append(turned_box(rng, x, y, rng.uniform(0.5, 2.0), rng.uniform(0.4, 0.8)))
+    return World.of("hall", shapes)
+
+
+KINDS: tuple[Callable[[np.random.Generator], World], ...] = (hotel, racking, rotunda, garage, classrooms, hall)
 
 
 def _arc(radius_m: float, start: float, end: float) -> NDArray[np.float64]:

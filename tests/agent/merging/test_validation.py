@@ -7,7 +7,7 @@ import pytest
 
 from agent.features.snapshot import MapSnapshot
 from agent.merging.scoring import weight_against
-from agent.merging.validation import evidence, turning
+from agent.merging.validation import evidence
 from agent.merging.views import witness
 from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
@@ -42,20 +42,3 @@ def test_a_wall_that_beams_passed_through_is_one() -> None:
 @pytest.mark.parametrize(("wall_share", "weight"), [(0.9, 1.0), (0.45, 1.0), (0.12, 0.69), (0.06, 0.58)])
 def test_conflicts_weigh_less_where_space_is_wide(wall_share: float, weight: float) -> None:
     assert weight_against(wall_share) == pytest.approx(weight, abs=0.02)
-
-
-def hall(outline: str) -> MapSnapshot:
-    """A round hall of 10 m, or a square one."""
-    rows, cols = np.mgrid[:120, :120] - 60.0
-    away = np.hypot(rows, cols) if outline == "round" else np.maximum(abs(rows), abs(cols))
-    cells = np.where(away < 50, FREE, UNKNOWN).astype(np.int8)
-    cells[(away >= 50) & (away < 51)] = OCCUPIED
-    return MapSnapshot.of(OccupancyGrid(cells, 0.1))
-
-
-def test_round_walls_do_not_say_how_they_are_turned_and_square_ones_do() -> None:
-    round_m, square_m = (
-        turning(witness(hall(outline)), witness(hall(outline)), SAME_FRAME[0]) for outline in ("round", "square")
-    )
-    assert round_m < 1.0
-    assert square_m > 6.0

@@ -21,6 +21,9 @@ GOOD = Grounds(
     attached_doubt=0.05,
     deep_doubt=0.01,
     distinct_m=20.0,
+    stretch_m=0.0,
+    loose_m=5.0,
+    astray_m=0.5,
     turning_m=20.0,
 )
 # what two parts of a building had to say for each other, one of them turned over
@@ -49,6 +52,32 @@ ROTUNDA = {
     "deep_doubt": 0.0,
     "turning_m": 6.0,
 }
+# two warehouses whose racks are the same distances apart, and two ends of one
+WAREHOUSES = {
+    "score": 52.0,
+    "rival": 13.9,
+    "agreeing_m": 142.2,
+    "against_m": 34.2,
+    "potential_m": 102.9,
+    "factor": 0.96,
+    "attached_doubt": 0.24,
+    "deep_doubt": 0.17,
+    "distinct_m": 23.4,
+    "stretch_m": 16.8,
+    "astray_m": 4.4,
+}
+RACKS = {
+    "score": 15.0,
+    "rival": 2.75,
+    "agreeing_m": 23.3,
+    "factor": 0.98,
+    "attached_doubt": 0.0,
+    "deep_doubt": 0.094,
+    "distinct_m": 6.0,
+}
+# two rooms of one rotunda, furnished each in its own way, and two classrooms
+ROOMS = {"score": 34.3, "rival": 11.4, "agreeing_m": 51.4, "loose_m": 0.2, "astray_m": 6.3}
+CLASSROOMS = {"score": 41.0, "rival": 20.65, "deep_doubt": 0.0, "loose_m": 14.4, "astray_m": 2.0}
 
 
 def test_good_grounds_merge() -> None:
@@ -62,6 +91,23 @@ def test_long_walls_alone_merge_when_no_rival_comes_near() -> None:
 def test_a_near_rival_does_not_hurt_what_is_flawless() -> None:
     assert verdict(replace(GOOD, rival=20.0, deep_doubt=0.0), MatchOptions()) == (MatchStatus.MERGED, Reason.MATCHED)
     assert verdict(replace(GOOD, **CORRIDOR), MatchOptions()) == (MatchStatus.MERGED, Reason.MATCHED)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        WAREHOUSES | {"stretch_m": 8.0},  # a gate, a lorry
+        WAREHOUSES | {"astray_m": 40.0},  # a park
+        RACKS | {"deep_doubt": 0.05},
+        ROOMS | {"loose_m": 2.0},
+        CLASSROOMS | {"astray_m": 1.0},
+        CLASSROOMS | {"loose_m": 30.0},  # a park
+        CLASSROOMS | {"rival": 14.0},
+        CLASSROOMS | {"score": 46.0},
+    ],
+)
+def test_what_changes_in_a_place_does_not_hurt(change: dict[str, float]) -> None:
+    assert verdict(replace(GOOD, **change), MatchOptions()) == (MatchStatus.MERGED, Reason.MATCHED)
 
 
 def test_what_hardly_says_how_it_is_turned_merges_without_a_rival() -> None:
@@ -91,6 +137,10 @@ def test_little_but_long_walls_must_be_less_suspicious() -> None:
         ({"rival": 20.0}, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
         ({"rival": 26.0, "deep_doubt": 0.0}, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
         (ROTUNDA, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
+        (WAREHOUSES, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
+        (RACKS, MatchStatus.AMBIGUOUS, Reason.RIVAL),
+        (ROOMS, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
+        (CLASSROOMS, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
         (HOTEL, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
         (MIRRORED_PARTS, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
     ],
