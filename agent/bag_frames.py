@@ -1,6 +1,7 @@
 """The frames of a bag: where the LIDAR sits on the robot, and which way up, out of /tf_static and /tf.
 
-A transform in /tf may move; the one from the odometry to the robot does, and is the motion of a bag without odometry messages.  The way from the robot to the LIDAR goes through their nearest common ancestor, so a moving root does no harm.
+A transform in /tf may move; the one from the odometry to the robot does, and is the motion of a bag without odometry
+messages.  The way from the robot to the LIDAR goes through their nearest common ancestor, so a moving root does no harm.
 """
 
 from __future__ import annotations
