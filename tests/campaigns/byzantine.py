@@ -24,9 +24,11 @@ from protocol.geometry import SE2
 from protocol.messages import GlobalMap
 from protocol.tiles import TileMap
 from tests.bench.tables import markdown, write_json
-from tests.fleet.attackers import ATTACKS, Liar
+from tests.fleet.attackers import ATTACKS
 from tests.fleet.explorer import Explorer, random_world
-from tests.fleet.simulation import Fleet, Node
+from tests.fleet.lying_maps import Liar
+from tests.fleet.processes import Node
+from tests.fleet.simulation import Fleet
 
 ROBOTS, ATTACK_S = 5, 60.0
 

@@ -29,7 +29,8 @@ from protocol.messages import Message
 from tests.bench.line_chart import log_log_chart
 from tests.bench.tables import markdown
 from tests.fleet.explorer import Explorer, judged, random_world
-from tests.fleet.simulation import Fleet, Node
+from tests.fleet.processes import Node
+from tests.fleet.simulation import Fleet
 
 ROBOTS_A_BUILDING, SPACING_M, RADIUS_M, CELL_M, SIDE_M = 5, 9.0, 8.0, 0.5, 60.0
 _WALLS_A_PLACE = 6  # two robots side by side share those between them

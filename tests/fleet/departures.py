@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from agent.fleet.state import FleetState
+from tests.fleet.processes import Node
 from tests.fleet.schedules import Outcome, Schedule
-from tests.fleet.simulation import Node
 
 NETWORK_FAULTS = ("loss", "delay", "duplicates", "partition", "one_way")
 ALL_KNOW_S = 15.0  # a quiet while before it dies, on most days

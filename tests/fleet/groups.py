@@ -5,7 +5,8 @@ from __future__ import annotations
 from agent.fleet.options import FleetOptions
 from protocol.geometry import SE2
 from tests.fleet.explorer import Explorer, random_world
-from tests.fleet.simulation import Fleet, Link, Node
+from tests.fleet.processes import Link, Node
+from tests.fleet.simulation import Fleet
 
 WORLD = random_world(1, 60.0, 0.5)
 PLACES = [SE2(-6, -5, 0.3), SE2(4, 2, -2.0), SE2(12, -8, 1.2), SE2(-10, 10, 2.6), SE2(3, 13, -0.7), SE2(-14, -4, 0.1)]

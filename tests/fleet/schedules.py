@@ -21,7 +21,8 @@ from agent.merging.result import MergeResult
 from protocol.geometry import SE2, wrap_angle
 from protocol.tiles import TileMap
 from tests.fleet.explorer import Explorer, judged, random_world
-from tests.fleet.simulation import Fleet, Link, Node
+from tests.fleet.processes import Link, Node
+from tests.fleet.simulation import Fleet
 
 FAULTS = ("loss", "delay", "duplicates", "partition", "one-way", "crash", "restart", "twin", "clock", "freeze", "unmerge")
 CELL_M, SIDE_M = 1.0, 48.0

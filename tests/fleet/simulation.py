@@ -7,12 +7,8 @@ in a map frame of its own; the matcher knows the true transforms but judges ever
 from __future__ import annotations
 
 import functools
-import heapq
-import itertools
 import random
-from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
 
 from agent.fleet.coordinator import Coordinator
 from agent.fleet.effects import Changed, Effect, Fetch, Fuse, Match, MatchKind, Note, Send
@@ -24,78 +20,32 @@ from protocol.channels import chunk_register
 from protocol.codec import decode, encode
 from protocol.errors import RemoteProtocolError
 from protocol.geometry import SE2
-from protocol.messages import Chunk, GlobalMap, Manifest, Message
+from protocol.messages import Chunk, Manifest, Message
 from tests.fleet.explorer import Explorer, judged
+from tests.fleet.processes import Link, Node
+from tests.fleet.timeline import Timeline
 
 TICK_S = 0.2
-
-
-@dataclass
-class Link:
-    """How one direction of the network behaves."""
-
-    loss: float = 0.0
-    delay_s: tuple[float, float] = (0.005, 0.03)
-    duplicates: float = 0.0
-
-
-@dataclass
-class Node:
-    """One robot process; `robot` is the id it uses, which should be its own."""
-
-    name: str
-    robot: str
-    explorer: Explorer | None
-    options: FleetOptions
-    coordinator: Coordinator | None = None
-    tap: Tap | None = None
-    life: int = 0
-    clock_offset_s: float = 0.0
-    global_map: GlobalMap | None = None
-    notes: list[Note] = field(default_factory=list)
-    sent: Counter[str] = field(default_factory=Counter)  # bytes by kind
-    messages: Counter[str] = field(default_factory=Counter)
-    received_messages: int = 0
-    received_bytes: int = 0
-    pulled_bytes: int = 0
-
-    @property
-    def is_up(self) -> bool:
-        return self.coordinator is not None
-
-
-class Tap:
-    """Sits in a robot's network socket: a hostile robot is an honest one whose words are changed on the way out."""
-
-    def say(self, fleet: Fleet, node: Node, message: Message, to: str) -> list[bytes]:
-        """What really goes to one receiver."""
-        return [encode(message)]
-
-    def answer(self, fleet: Fleet, node: Node, key: str, data: bytes | None) -> bytes | None:
-        """What really is answered to a query."""
-        return data
 
 
 Judge = Callable[["Fleet", Node, Match], MergeResult]
 
 
-class Fleet:
-    """The event loop: time, network, and what the coordinators ask for."""
+class Fleet(Timeline):
+    """Robots and the network between them, and what the coordinators ask for."""
 
     def __init__(self, seed: int, *, link: Link | None = None, judge: Judge | None = None, is_encoded: bool = True) -> None:
+        super().__init__()
         self.rng = random.Random(seed)
         self.link = link or Link()
         self.judge = judge or truthful
         self.is_encoded = is_encoded
         self._decode = decode if is_encoded else functools.lru_cache(maxsize=4_096)(decode)  # everybody reads the same object
         self.tick_s = TICK_S
-        self.now_s = 0.0
         self.nodes: dict[str, Node] = {}
         self._by_robot: dict[str, list[Node]] = {}
         self.partition: dict[str, int] = {}
         self.blocked: set[tuple[str, str]] = set()  # one-way cuts
-        self._events: list[tuple[float, int, Callable[[], None]]] = []
-        self._order = itertools.count()
         self._fusions: dict[tuple[object, ...], FusedMap] = {}
 
     # Robots.
@@ -126,26 +76,6 @@ class Fleet:
 
     def local_s(self, node: Node) -> float:
         return self.now_s + node.clock_offset_s
-
-    # Time.
-
-    def at(self, delay_s: float, action: Callable[[], None]) -> None:
-        heapq.heappush(self._events, (self.now_s + delay_s, next(self._order), action))
-
-    def run(self, duration_s: float) -> None:
-        end_s = self.now_s + duration_s
-        while self._events and self._events[0][0] <= end_s:
-            self.now_s, _, action = heapq.heappop(self._events)
-            action()
-        self.now_s = end_s
-
-    def run_until(self, condition: Callable[[], bool], timeout_s: float, step_s: float = 0.2) -> float:
-        """Simulated seconds until the condition holds; fails the test when it does not in time."""
-        start_s = self.now_s
-        while not condition():
-            assert self.now_s - start_s < timeout_s, f"not within {timeout_s} simulated seconds: {self.describe()}"
-            self.run(step_s)
-        return self.now_s - start_s
 
     def _tick(self, node: Node, life: int) -> None:
         if node.life != life or node.coordinator is None:
@@ -329,7 +259,7 @@ class Fleet:
         return all(other is not None and other.digest == first.digest and other.members == first.members for other in maps)
 
     def describe(self) -> str:
-        lines = [f"t={self.now_s:.1f} digests={self.digests()}"]
+        lines = [f"{super().describe()} digests={self.digests()}"]
         for node in self.nodes.values():
             if node.coordinator is not None:
                 state = node.coordinator.state(self.local_s(node))

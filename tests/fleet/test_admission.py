@@ -15,9 +15,9 @@ from agent.fleet.peer import Peer
 from protocol.features import FeatureMap
 from protocol.geometry import SE2
 from protocol.grid import FREE, OCCUPIED, OccupancyGrid
-from tests.fleet.attackers import Liar
 from tests.fleet.explorer import Explorer, random_world
 from tests.fleet.groups import fleet_of, names
+from tests.fleet.lying_maps import Liar
 from tests.fleet.simulation import Fleet
 
 NAMES = ["r0", "r1", "r2"]

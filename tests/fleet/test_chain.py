@@ -14,7 +14,8 @@ from hw.sim.worlds import office
 from protocol.geometry import SE2
 from protocol.grid import UNKNOWN, OccupancyGrid
 from tests.fleet.explorer import Explorer
-from tests.fleet.simulation import Fleet, Node
+from tests.fleet.processes import Node
+from tests.fleet.simulation import Fleet
 
 PARTS = {"r0": (0.0, 0.5), "r1": (0.25, 0.78), "r2": (0.52, 1.0)}  # of the office, from west to east
 

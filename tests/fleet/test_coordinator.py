@@ -16,7 +16,8 @@ from protocol.messages import Beat, GlobalMeta, Stance, Statement
 from protocol.tiles import TileMap
 from tests.fleet.explorer import Explorer
 from tests.fleet.groups import PLACES, WORLD, edges, fleet_of, names
-from tests.fleet.simulation import Fleet, Link
+from tests.fleet.processes import Link
+from tests.fleet.simulation import Fleet
 
 
 def test_two_robots_agree_on_one_map_within_seconds() -> None:

@@ -22,7 +22,8 @@ from protocol.messages import Beat, FineTiles, MapAnnouncement, MapVersion, Mess
 from protocol.tiles import TileMap
 from tests.fleet.explorer import Explorer, random_world
 from tests.fleet.groups import PLACES, WORLD, edges, events, fleet_of, names
-from tests.fleet.simulation import Fleet, Node, truthful
+from tests.fleet.processes import Node
+from tests.fleet.simulation import Fleet, truthful
 from tests.protocol.examples import evidence
 
 

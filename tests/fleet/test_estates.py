@@ -11,9 +11,10 @@ from agent.fleet.state import Presence
 from protocol.codec import decode, encode
 from protocol.geometry import SE2
 from protocol.messages import NO_DIGEST, Estate, Stance, Statement, Statements
-from tests.fleet.attackers import InventedRobot
 from tests.fleet.groups import edges, fleet_of
-from tests.fleet.simulation import Fleet, Node, Tap
+from tests.fleet.lying_words import InventedRobot
+from tests.fleet.processes import Node, Tap
+from tests.fleet.simulation import Fleet
 
 ALL = ["r0", "r1", "r2", "r3"]
 

@@ -15,7 +15,8 @@ from agent.merging.result import MatchStatus, MergeResult
 from protocol.geometry import SE2
 from protocol.messages import Beat
 from tests.fleet.explorer import Explorer, random_world
-from tests.fleet.simulation import Fleet, Node, truthful
+from tests.fleet.processes import Node
+from tests.fleet.simulation import Fleet, truthful
 
 NAMES = ["r0", "r1", "r2"]
 MEMORY = FleetMemory(3, {"r1": SE2(1.5, -2.0, 0.25), "r7": SE2(0.0, 0.0, 3.0)}, ("r9",))
