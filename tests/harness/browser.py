@@ -70,7 +70,7 @@ class Browser:
         """The WebSocket address of the first page."""
         deadline_s = time.monotonic() + START_WITHIN_S
         while time.monotonic() < deadline_s:
-            with contextlib.suppress(OSError, ValueError, StopIteration):
+            with contextlib.suppress(OSError, ValueError, IndexError, StopIteration):  # the file is there before its first line
                 port = (profile / "DevToolsActivePort").read_text().split()[0]
                 with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=2.0) as answer:
                     return str(next(page["webSocketDebuggerUrl"] for page in json.load(answer) if page["type"] == "page"))
