@@ -70,6 +70,10 @@ class Keeper:
         """The map worker makes one between two scans; `save_checkpoint` puts it on disk."""
         self._node.map.call(lambda: self._checkpoints.put(self._node.map.mapper.checkpoint()))
 
+    def drop_checkpoint(self) -> None:
+        """One that was made and not saved yet is of a map that is gone."""
+        self._checkpoints.take()
+
     def save_checkpoint(self) -> None:
         """Save what the map worker made, if it did."""
         checkpoint = self._checkpoints.take()

@@ -207,6 +207,7 @@ class Node:
             epoch = self.map.mapper.epoch + 1
             self.map.mapper = Mapper(mapping_options(self.config), self.config.mapping.seed, fit_in_own_map)
             self.map.mapper.epoch = epoch
+            self.keeper.drop_checkpoint()
             if self.state is not None:
                 self.state.forget("mapper")
                 self.state.forget("fleet")

@@ -69,3 +69,14 @@ def test_a_map_that_is_being_worked_on_is_not_saved(tmp_path: Path) -> None:
     assert node.state is not None
     assert node.state.load("mapper") is None
     go_on.set()
+
+
+def test_a_map_that_was_reset_does_not_come_back_from_the_disk(tmp_path: Path) -> None:
+    """The keeper may have asked for the old one a moment before."""
+    node = robot(tmp_path)
+    assert node.state is not None
+    node.keeper.ask_for_checkpoint()
+    node.reset_map()
+    node.map.step()
+    node.keeper.save_checkpoint()
+    assert node.state.load("mapper") is None
