@@ -18,6 +18,8 @@ from agent.mapping.kept_scans import KeptScan
 from agent.mapping.likelihood import AREA
 from agent.mapping.log_odds import LogOddsGrid
 from agent.mapping.loop_closure import LoopCloser
+from agent.mapping.packed_rows import PackedRows
+from agent.mapping.particle_filter import NO_NUMBERS, NO_POSES
 from agent.mapping.path_graph import LoopEdge
 from agent.mapping.redrawing import Drawing
 from agent.mapping.state_block import CheckpointError, State, opened, sealed
@@ -111,8 +113,8 @@ def filter_state(mapper: Mapper) -> State:
         "lineage": np.array(particles.lineage, np.int64),
         "line": particles.line,
         "path_sizes": np.array([len(p) for p in particles.path], np.int64),
-        "path": np.vstack([np.empty((0, 3)), *particles.path]),
-        "parents": np.concatenate([np.empty(0, np.uint16), *particles.parents]),
+        "path": np.vstack([NO_POSES, *particles.path]),
+        "parents": np.concatenate([NO_NUMBERS, *particles.parents]),
         "tables": tables.astype(np.int32),
         "tiles": fields.pool[used],
         "fields.first_tile": fields.first_tile,
@@ -218,7 +220,8 @@ def put_filter(mapper: Mapper, state: State) -> None:
     particles.lineage, particles.line = state["lineage"].tolist(), state["line"]
     ends = np.cumsum(state["path_sizes"])[:-1]
     if len(state["path_sizes"]):
-        particles.path, particles.parents = np.split(state["path"], ends), np.split(state["parents"], ends)
+        particles.path = PackedRows(NO_POSES, np.split(state["path"], ends))
+        particles.parents = PackedRows(NO_NUMBERS, np.split(state["parents"], ends))
     particles.fields.put(tables.astype(np.int64), tiles, state["fields.first_tile"])
 
 

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.mapping.likelihood import TiledFields
+from agent.mapping.packed_rows import PackedRows
 from agent.mapping.scan_matching import Fit, Poses, information, placed, refine
 
 FIELD_SIGMA_M = 0.06  # 0.1 lost one building on every seed, 0.04 falls out of the basin of Gauss-Newton
@@ -39,6 +40,7 @@ GROW_ABOVE = 1.5  # times as many wanted as there are: do not wait for the weigh
 MOST_PARTICLES = 2000  # whatever was asked for
 
 Numbers = NDArray[np.uint16]
+NO_POSES, NO_NUMBERS = np.empty((0, 3)), np.empty(0, np.uint16)
 
 
 class ParticleFilter:
@@ -50,8 +52,8 @@ class ParticleFilter:
         self.fields = TiledFields(particles, resolution_m, FIELD_SIGMA_M)
         self.poses: Poses = np.zeros((particles, 3))  # T_map_robot of every particle
         self.log_weights = np.zeros(particles)
-        self.path: list[Poses] = []  # poses at every keyframe so far
-        self.parents: list[Numbers] = []  # particle i of keyframe k came from particle parents[k][i] of k - 1
+        self.path = PackedRows(NO_POSES)  # poses at every keyframe so far
+        self.parents = PackedRows(NO_NUMBERS)  # particle i of keyframe k came from particle parents[k][i] of k - 1
         self.next_parents: Numbers = np.arange(particles, dtype=np.uint16)
         self.followed = 0  # the particle that is tracked and drawn
         self.lineage: list[int] = []  # its ancestor at every keyframe of the path ...
@@ -122,7 +124,7 @@ class ParticleFilter:
         self.fields.stamp(x, y)
 
     def _remember(self) -> None:
-        self.path.append(self.poses.copy())
+        self.path.append(self.poses)
         self.parents.append(self.next_parents)
         self.next_parents = np.arange(self.particles, dtype=np.uint16)
 
@@ -167,7 +169,9 @@ class ParticleFilter:
         return 0
 
     def _forget(self, keyframes: int) -> None:
-        del self.path[:keyframes], self.parents[:keyframes], self.lineage[:keyframes]
+        self.path.drop(keyframes)
+        self.parents.drop(keyframes)
+        del self.lineage[:keyframes]
         self.forgotten += keyframes
 
     def adopt(self, line: Poses, field: TiledFields) -> None:
@@ -175,8 +179,8 @@ class ParticleFilter:
         correction = composed(line[-1:], inverted(self.line[-1:]))
         self.poses = composed(np.repeat(correction, self.particles, axis=0), self.poses)
         self.line = line.copy()
-        self.path = [pose[None] for pose in line[self.forgotten :]]
-        self.parents = [np.zeros(1, np.uint16) for _ in self.path]
+        self.path = PackedRows(NO_POSES, (pose[None] for pose in line[self.forgotten :]))
+        self.parents = PackedRows(NO_NUMBERS, (np.zeros(1, np.uint16) for _ in self.path))
         self.next_parents = np.zeros(self.particles, np.uint16)
         self.lineage = [0] * len(self.path)
         self.fields.put(np.repeat(field.tables, self.particles, axis=0), field.pool, field.first_tile)
