@@ -16,6 +16,6 @@ class Traffic:
     received_bytes: int = 0
     pulled_bytes: int = 0
     served_bytes: int = 0
-    refused: int = 0  # too large
+    refused: int = 0  # too large, or said while there was no session
     unanswered: int = 0
     dropped_queries: int = 0
