@@ -7,8 +7,11 @@ key uses it, and passed over where it stands below a key of somebody else's.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 
 MAX_LIST = 1000
+MAX_LIST_CHARS = 16_000
+_OPEN_LIST = re.compile(r"[A-Za-z_][\w.\-]*\s*:\s+\[[^\]]*$")
 _KEY = re.compile(r"""(?P<quote>["']?)(?P<key>[A-Za-z_][\w.\-]*)(?P=quote)\s*:(?:\s+(?P<value>.*))?$""")
 
 
@@ -20,8 +23,7 @@ def parse_flat_yaml(text: str) -> dict[str, str | list[str]]:
     """Every top-level key with its value."""
     values: dict[str, str | list[str]] = {}
     key = ""
-    for number, raw in enumerate(text.splitlines(), 1):
-        line = _without_comment(raw).rstrip()
+    for number, line in _whole_lines(text):
         if not line or line in ("---", "...") or line.startswith("%"):
             continue
         item = re.match(r"\s*-\s+(.*)$", line)
@@ -32,6 +34,22 @@ def parse_flat_yaml(text: str) -> dict[str, str | list[str]]:
         else:
             key = _top_level(values, line, number)
     return values
+
+
+def _whole_lines(text: str) -> Iterator[tuple[int, str]]:
+    """Lines without comments, by the number they begin at; a list in brackets that goes on below is one line."""
+    begun, open_list = 0, ""
+    for number, raw in enumerate(text.splitlines(), 1):
+        line = _without_comment(raw).rstrip()
+        if open_list:
+            line = f"{open_list} {line.strip()}"
+        if _OPEN_LIST.match(line) and len(line) < MAX_LIST_CHARS:
+            begun, open_list = begun if open_list else number, line
+            continue
+        yield begun if open_list else number, line
+        open_list = ""
+    if open_list:
+        yield begun, open_list
 
 
 def _top_level(values: dict[str, str | list[str]], line: str, number: int) -> str:
@@ -58,7 +76,7 @@ def _value(text: str, number: int) -> str | list[str]:
     if not text.startswith("["):
         return _scalar(text, number)
     if not text.endswith("]") or text.count("[") != 1:
-        raise FlatYamlError(f"line {number}: expected a list like [1.0, 2.0, 0.0] on one line, saw {text[:60]!r}")
+        raise FlatYamlError(f"line {number}: expected a list like [1.0, 2.0, 0.0], saw {text[:60]!r}")
     return [_scalar(part.strip(), number) for part in text[1:-1].split(",", MAX_LIST) if part.strip()]
 
 

@@ -15,8 +15,9 @@ guilty until proven: its size is read from the header before anything is decoded
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 
 import cv2
 import numpy as np
@@ -60,11 +61,18 @@ def load_map(path: str | Path) -> OccupancyGrid:
     yaml_path = Path(path)
     settings = read_settings(yaml_path)
     try:
-        pixels = load_image(yaml_path.parent / settings.image)
+        pixels = load_image(yaml_path.parent / os.path.expanduser(settings.image))
     except ImageFileError as error:
-        raise MapFileError(f"{yaml_path}: {error}") from error
+        raise MapFileError(f"{yaml_path}: {error}{_beside(yaml_path, settings.image)}") from error
     cells = cells_of(pixels, as_saved(pixels, settings))
     return OccupancyGrid(np.ascontiguousarray(cells[::-1]), settings.resolution_m, settings.origin)
+
+
+def _beside(yaml_path: Path, image: str) -> str:
+    """A hint for a map that was copied from elsewhere: the image is there, but not where the YAML says."""
+    name = PureWindowsPath(image).name  # takes / and \\ for the end of a folder
+    is_there = name != image and "\0" not in name and (yaml_path.parent / name).is_file()
+    return f"; {name} lies beside it: write image: {name}" if is_there else ""
 
 
 def save_map(grid: OccupancyGrid, stem: str | Path) -> tuple[Path, Path]:
@@ -97,15 +105,27 @@ def yaml_text(grid: OccupancyGrid, image: str) -> str:
 def read_settings(path: Path) -> MapSettings:
     """The YAML, checked; nothing of the image is touched."""
     try:
+        if not (path.is_file() or path.is_dir()) and path.exists():
+            raise MapFileError(f"{path}: no file but a device or a pipe; save the YAML to a file first")
         with path.open("rb") as stream:
             data = stream.read(MAX_YAML_BYTES + 1)
         if len(data) > MAX_YAML_BYTES or data[:2] in (b"P5", b"P2", b"\x89P"):
             raise MapFileError(f"{path}: this is no map YAML; give the .yaml file that names the image")
-        return _settings(path, parse_flat_yaml(data.decode("utf-8-sig")))
+        return _settings(path, parse_flat_yaml(_text(data)))
     except OSError as error:
         raise MapFileError(f"{path}: {error.strerror or error}") from error
-    except (UnicodeDecodeError, FlatYamlError) as error:
+    except FlatYamlError as error:
         raise MapFileError(f"{path}: no map YAML: {error}") from error
+
+
+def _text(data: bytes) -> str:
+    """UTF-8, or what Windows writes: UTF-16 begins with its mark, and the letters of Latin-1 stand in comments and names only."""
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return data.decode("utf-16", "replace")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
 
 
 def as_saved(pixels: Pixels, settings: MapSettings) -> MapSettings:
@@ -164,8 +184,10 @@ def _sure(percent: NDArray[np.float64]) -> NDArray[np.int64]:
 def _settings(path: Path, values: dict[str, str | list[str]]) -> MapSettings:
     for key in ("image", "resolution", "origin"):
         if key not in values:
-            raise MapFileError(f"{path}: '{key}' is missing; a nav2 map YAML has image, resolution and origin")
+            other = next((f"saw '{other}': keys are in lower case" for other in values if other.lower() == key), "")
+            raise MapFileError(f"{path}: '{key}' is missing; {other or 'a nav2 map YAML has image, resolution and origin'}")
     image, mode = values["image"], values.get("mode", "trinary")
+    mode = mode.lower() if isinstance(mode, str) else mode
     if not isinstance(image, str) or not image:
         raise MapFileError(f"{path}: image: expected a file name, saw {image!r}")
     if mode not in MODES:
@@ -182,7 +204,8 @@ def _settings(path: Path, values: dict[str, str | list[str]]) -> MapSettings:
 def _origin(path: Path, value: str | list[str]) -> SE2:
     if not isinstance(value, list) or len(value) not in (2, 3):
         raise MapFileError(f"{path}: origin: expected [x, y, yaw], saw {value!r}")
-    x_m, y_m, yaw_rad = (_number(path, "origin", text, -1e7, 1e7) for text in [*value, "0"][:3])
+    x_m, y_m = (_number(path, "origin", text, -1e7, 1e7) for text in value[:2])
+    yaw_rad = _number(path, "origin: yaw in radians", [*value, "0"][2], -math.tau, math.tau)
     return SE2(x_m, y_m, yaw_rad)
 
 

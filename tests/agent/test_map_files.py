@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import struct
 import tracemalloc
 from pathlib import Path
@@ -170,8 +171,34 @@ def test_yaml_as_other_tools_write_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    "data",
+    [
+        YAML.encode("utf-16"),
+        ("\ufeff" + YAML).encode("utf-16-be"),
+        ("# B\u00fcro\n" + YAML).encode("latin-1"),
+        YAML.replace("[-1.5, 2.25, 0.1]", "[-1.5,  # x\n  2.25,\n  0.1]").encode(),
+        (YAML + 'mode: "Trinary"\n').encode(),
+        YAML.replace(": ", ":\t").replace("0.05", "5e-2").encode(),
+    ],
+)
+def test_yaml_as_windows_and_people_write_it(data: bytes, tmp_path: Path) -> None:
+    written(tmp_path, "").write_bytes(data)
+    grid = load_map(tmp_path / "map.yaml")
+    assert (grid.resolution_m, grid.origin) == (0.05, SE2(-1.5, 2.25, 0.1))
+    assert grid.cells.tolist() == [[OCCUPIED, UNKNOWN, FREE]]
+
+
+@pytest.mark.parametrize("image", ["/home/ann/maps/map.pgm", "C:\\maps\\map.pgm", "maps/map.pgm", "~/of-ann/map.pgm"])
+def test_a_map_that_was_copied_says_where_its_image_is(image: str, tmp_path: Path) -> None:
+    with pytest.raises(MapFileError, match=r"No such file or directory; map\.pgm lies beside it: write image: map\.pgm"):
+        load_map(written(tmp_path, YAML.replace("map.pgm", image)))
+
+
+@pytest.mark.parametrize(
     ("change", "said"),
     [
+        (("image: map.pgm", "Image: map.pgm"), "'image' is missing; saw 'Image': keys are in lower case"),
+        (("0.1]", "90]"), "origin: yaw in radians: expected a number from -6.28319 to 6.28319, saw '90'"),
         (("image: map.pgm", "image: none.pgm"), "none.pgm: No such file"),
         (("image: map.pgm\n", ""), "'image' is missing"),
         (("image: map.pgm", "image:"), "image: expected a file name"),
@@ -288,3 +315,6 @@ def test_an_image_that_never_ends_is_not_read(tmp_path: Path) -> None:
     (tmp_path / "a.yaml").write_text("image: /dev/zero\nresolution: 0.05\norigin: [0, 0, 0]\n")
     with pytest.raises(MapFileError, match="a device or a pipe"):
         load_map(tmp_path / "a.yaml")
+    os.mkfifo(tmp_path / "pipe.yaml")
+    with pytest.raises(MapFileError, match="a device or a pipe"):
+        load_map(tmp_path / "pipe.yaml")
