@@ -62,7 +62,7 @@ class MatchOptions:
     min_margin_m: float = 6.5  # metres of wall by which the best must beat the best distinct alternative; 8 costs 5 % of merges
     min_agreeing_m: float = 8.0  # of firm wall
     max_rival_share: float = 0.72  # of the best score
-    near_rival_share: float = 0.35  # above it the building may repeat itself: what merges then has no flaw
+    near_rival_share: float = 0.32  # above it the building may repeat itself: what merges then has no flaw
     some_rival_share: float = 0.15  # above it, the maps must agree in what tells places apart
     min_observability_m: float = 2.0  # of wall that fixes the worst-seen direction, and
     min_observable_share: float = 0.1  # of agreeing wall: along a long corridor two metres of cross wall are an accident

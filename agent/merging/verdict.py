@@ -29,8 +29,8 @@ MARGIN_PER_GRAVE_SUSPICION_M = 45.0  # mirrored parts of a building at 1.2 were 
 MIN_DISTINCT_M = 4.0  # two ends of a building share long walls; what tells them apart is short,
 CLEAR_MARGIN_M = 25.0  # unless nothing else comes near: ends that were merged wrongly were ahead by 7 to 13 m
 FLAWED_SHARE, FLAW = 0.45, 0.002  # a rival of this share of the score, and of `deep_doubt` more than none
-ODD_M = 1.5  # in the middle of free space, where
-INDOOR_SHARE = 0.5  # of what agrees is more than there is of loose things; in the open these come and go
+ODD_M, ODD_MARGIN_M = 1.5, 40.0  # in the middle of free space; classrooms that were merged wrongly were ahead by up to 29 m
+INDOOR_SHARE = 0.4  # of what agrees is more than there is of loose things; in the open these come and go
 DEEP_ALONE = 2.0  # doubt per root of `deep_doubt`; true pairs keep their margins up to 2.2
 STRETCH_M, STRETCH_SHARE = 3.0, 0.06  # of one wall in the open: true pairs reach 0.065 of what agrees among cars,
 STRETCH_PER_ASTRAY = 0.25  # and 0.105 among plants, where things astray tell that little fits better
@@ -116,12 +116,13 @@ def _is_one_of_many(g: Grounds, options: MatchOptions) -> bool:
     Two ends of a hotel with one kind of room fit over fifty metres of wall, shifted by a room nearly as well.  A true overlap
     with a rival so near is flawless, as a rule; a wrong one has some furniture in the middle of the other map's free space.
     """
-    share, is_clear = g.rival / g.score, g.score - g.rival > CLEAR_MARGIN_M
+    share = g.rival / g.score
     if share <= options.near_rival_share:
         return False
     is_indoors = g.loose_m + g.astray_m < INDOOR_SHARE * g.agreeing_m
-    is_odd = is_indoors and g.astray_m + g.deep_doubt * g.agreeing_m > ODD_M and not is_clear
-    return is_odd or (share > FLAWED_SHARE and g.deep_doubt > FLAW) or (share > REPEATED_SHARE and g.rival > REPEATED_M)
+    is_odd = g.astray_m + g.deep_doubt * g.agreeing_m > ODD_M and g.score - g.rival < ODD_MARGIN_M
+    is_flawed = (is_indoors and is_odd) or (share > FLAWED_SHARE and g.deep_doubt > FLAW)
+    return is_flawed or (share > REPEATED_SHARE and g.rival > REPEATED_M)
 
 
 def _is_one_of_a_few(g: Grounds, options: MatchOptions) -> bool:

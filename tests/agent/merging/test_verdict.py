@@ -76,7 +76,7 @@ RACKS = {
     "distinct_m": 6.0,
 }
 # two rooms of one rotunda, furnished each in its own way, and two classrooms
-ROOMS = {"score": 34.3, "rival": 11.4, "agreeing_m": 51.4, "loose_m": 0.2, "astray_m": 6.3}
+ROOMS = {"score": 18.6, "rival": 7.1, "agreeing_m": 27.4, "deep_doubt": 0.0, "loose_m": 0.3, "astray_m": 1.3}
 CLASSROOMS = {"score": 41.0, "rival": 20.65, "deep_doubt": 0.0, "loose_m": 14.4, "astray_m": 2.0}
 
 
@@ -102,8 +102,8 @@ def test_a_near_rival_does_not_hurt_what_is_flawless() -> None:
         ROOMS | {"loose_m": 2.0},
         CLASSROOMS | {"astray_m": 1.0},
         CLASSROOMS | {"loose_m": 30.0},  # a park
-        CLASSROOMS | {"rival": 14.0},
-        CLASSROOMS | {"score": 46.0},
+        CLASSROOMS | {"rival": 12.5},
+        CLASSROOMS | {"score": 60.7},
     ],
 )
 def test_what_changes_in_a_place_does_not_hurt(change: dict[str, float]) -> None:
