@@ -63,7 +63,6 @@ class Overview:
             peer.robot in self._ledger.roster.unmerged,
             peer.map,
             peer.known_area_m2,
-            beat.load if beat else 0.0,
             round(peer.trust.strikes),
             frame.T_global_map @ T_map_robot if frame is not None and T_map_robot is not None else None,
             "merged" if live is not None else pair.phase if pair else "unseen",

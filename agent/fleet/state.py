@@ -28,7 +28,6 @@ class PeerState:
     is_unmerged: bool  # by the operator, with `unmerge`
     map: MapVersion | None
     known_area_m2: float
-    load: float
     strikes: int
     T_global_robot: SE2 | None
     pair: str  # "unseen", "coarse", "hopeful", "searching", "ambiguous", "no", "proposed", "verifying", "merged", "withdrawn"
