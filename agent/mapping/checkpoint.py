@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import struct
 import zlib
+from dataclasses import astuple
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,6 +25,7 @@ from agent.mapping.path_graph import LoopEdge
 from agent.mapping.redrawing import Drawing
 from agent.mapping.state_block import CheckpointError, State, opened, sealed
 from agent.mapping.trajectory import ROW
+from agent.mapping.twist import TwistMeans
 from protocol.geometry import SE2
 
 if TYPE_CHECKING:
@@ -72,6 +74,7 @@ def state_of(mapper: Mapper) -> State:
         "keyframe_s": local.keyframe_s,
         "keyframe_variance": local.keyframe_variance,
         "scans": local.scans.rows.view(np.uint8).reshape(-1, ROW.itemsize),
+        "twists": np.array(astuple(local.twists)),
         **search_state(mapper),
         **filter_state(mapper),
         **drawing_state(local.drawing),
@@ -189,6 +192,7 @@ def put_state(mapper: Mapper, state: State) -> None:
         state["keyframe_variance"],
     )
     local.scans.rows = state["scans"].view(ROW)[:, 0]
+    local.twists = TwistMeans(*state["twists"].tolist()) if "twists" in state else TwistMeans()
     put_filter(mapper, state)
     put_drawing(local.drawing, state)
     put_loops(local.loops, state)

@@ -8,6 +8,7 @@ update    a keyframe       all particles; the grid of the followed    particle_f
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +21,11 @@ from agent.mapping.particle_filter import ParticleFilter, composed
 from agent.mapping.path_graph import apart
 from agent.mapping.redrawing import Drawing
 from agent.mapping.relocalization import Relocalization
+from agent.mapping.scan_matching import information
 from agent.mapping.scan_points import ScanPoints
 from agent.mapping.tracking import Tracked, track
 from agent.mapping.trajectory import Trajectory
+from agent.mapping.twist import STANDING_M, TwistMeans, refine_twisted, way_m
 from protocol.geometry import SE2, wrap_angle
 
 UNKNOWN_MOTION = (0.5, 0.4)  # one sigma, metres and radians, when odometry says nothing
@@ -42,6 +45,7 @@ class LocalMap:
         self.keyframe_s = math.nan
         self.keyframe_variance = np.zeros(2)  # of the motion since then
         self.scans = Trajectory()
+        self.twists = TwistMeans()
 
     @property
     def is_empty(self) -> bool:
@@ -63,6 +67,17 @@ class LocalMap:
         predicted = self.predicted(motion)
         fields, particle = self.filter.fields, self.filter.followed
         return track(fields, particle, self.drawing.coarse, predicted, step, deviation, points.surfels)
+
+    def untwist(self, motion: Motion, points: ScanPoints, tracked: Tracked) -> tuple[Tracked, float]:
+        """The same scan, matched once more together with its twist: how far the robot turned meanwhile beyond its wheels."""
+        share = min(points.revolution_s / max(points.stamp_s - self.last_scan_s, 1e-3), 1.0)
+        if not motion.is_known or not points.surfel_turns.any() or way_m(motion.T_from_to) * share < STANDING_M:
+            return tracked, 0.0
+        predicted, weights = self.predicted(motion), information(*self.options.motion_noise.deviations(motion.T_from_to))
+        fields, particle = self.filter.fields, self.filter.followed
+        pose, twist_rad = refine_twisted(fields, particle, tracked.pose, predicted, weights, points.surfels, points.surfel_turns)
+        turned_rad = wrap_angle(float(pose[2] - predicted[2])) * share
+        return replace(tracked, pose=pose), self.twists.corrected(twist_rad, turned_rad)
 
     def predicted(self, motion: Motion) -> NDArray[np.float64]:
         return as_array(as_pose(self.pose) @ motion.T_from_to)

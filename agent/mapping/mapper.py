@@ -102,13 +102,14 @@ class Mapper:
             return self._contradicted(points, tracked)
         self.contradictions = 0
         self.usual_fraction += (tracked.fraction - self.usual_fraction) / USUAL_OVER
+        tracked, twist_rad = self.map.untwist(motion, points, tracked)
         skew_rad = self._skew_rad(points, motion, tracked)
         self._check_wheels(motion, tracked, skew_rad)
         self.map.note_motion(motion)
         self.confirmations_missing = max(self.confirmations_missing - 1, int(skew_rad > SKEWED_RAD))
         is_keyframe = self.confirmations_missing == 0 and self.map.is_keyframe(points.stamp_s, tracked.pose)
         if is_keyframe:
-            self.map.update(points, tracked.pose)
+            self.map.update(points.untwisted(twist_rad), tracked.pose)
         self.map.accept(points.stamp_s, self.map.keyframe_pose.copy() if is_keyframe else tracked.pose)
         loop = self.map.redraw() if is_keyframe or self.map.drawing.is_bending else None
         self.loops_closed += loop is not None

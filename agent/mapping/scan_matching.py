@@ -68,6 +68,15 @@ def linearised(
     field's ripple along a wall holds nothing back.  Points without one (corners, lone ones) follow the field's slope.
     Gauss-Newton on 1 - L would only halve the error in each step, for the field is flat on the wall; this one removes it.
     """
+    value, slope, stiffness, moves = springs(fields, particles, poses, surfels)
+    curvature = np.einsum("pim,pjm->pij", moves * stiffness[:, None], moves)
+    return value, np.einsum("pim,pm->pi", moves, slope).astype(np.float64), curvature.astype(np.float64)
+
+
+def springs(
+    fields: TiledFields, particles: NDArray[np.int64], poses: Poses, surfels: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Under every point (P, M): field value, slope and stiffness; and (P, 3, M) how the pose moves it along its normal."""
     x, y, arm_x, arm_y = placed(poses, surfels)
     value, slope_x, slope_y = fields.look_up(particles, x, y)
     normal_x, normal_y = turned_normals(poses, surfels)
@@ -76,13 +85,11 @@ def linearised(
         length = np.sqrt(slope_x[:, lone] ** 2 + slope_y[:, lone] ** 2 + FLAT_SLOPE**2)
         normal_x[:, lone], normal_y[:, lone] = slope_x[:, lone] / length, slope_y[:, lone] / length
     slope, held = slope_x * normal_x + slope_y * normal_y, value.copy()
-    direction = np.stack([normal_x, normal_y, normal_y * arm_x - normal_x * arm_y], axis=1)  # (P, 3, M)
+    moves = np.stack([normal_x, normal_y, normal_y * arm_x - normal_x * arm_y], axis=1)  # (P, 3, M)
     if len(lone):
         slope[:, lone] *= LONE_WEIGHT
         held[:, lone] *= LONE_WEIGHT
-    stiffness = held * np.float32(fields.sigma_m**-2)
-    curvature = np.einsum("pim,pjm->pij", direction * stiffness[:, None], direction)
-    return value, np.einsum("pim,pm->pi", direction, slope).astype(np.float64), curvature.astype(np.float64)
+    return value, slope, held * np.float32(fields.sigma_m**-2), moves
 
 
 def turned_normals(poses: Poses, surfels: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

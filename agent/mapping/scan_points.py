@@ -7,7 +7,7 @@ the robot turned is put where it belongs.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,20 @@ class ScanPoints:
     is_partial: bool
     is_all_round: bool  # from one place it sees the same, whichever way the robot looks
     revolution_s: float  # from its first beam to its last
+    ranges_m: NDArray[np.float64]  # (N,) of every return, cut rays as far as the cut
+    turns: NDArray[np.float32]  # (N,) when each was measured, in revolutions from stamp_s: -0.5 to 0.5
+    surfel_turns: NDArray[np.float32]  # (M,) the same of the surfels
+
+    def untwisted(self, twist_rad: float) -> ScanPoints:
+        """As they are if the robot turned by this much more within the revolution than its wheels told."""
+        if twist_rad == 0.0:
+            return self
+        x, y = self.points_m.T
+        cos, sin = np.cos(twist_rad * self.turns), np.sin(twist_rad * self.turns)
+        ends = np.stack([cos * x - sin * y, sin * x + cos * y], axis=1).astype(np.float32)
+        surfels, surfel_turns = to_match(ends, self.is_hit, self.turns)
+        surface_m = surface_points(ends, self.is_hit, self.ranges_m)
+        return replace(self, points_m=ends, surfels=surfels, surface_m=surface_m, surfel_turns=surfel_turns)
 
     @property
     def n(self) -> int:
@@ -69,21 +83,36 @@ def scan_points(scan: LaserScan, track: OdometryTrack, options: MappingOptions) 
     points = options.T_base_laser.apply(points_laser)
     stamp_s = reference_stamp_s(scan)
     reference = track.pose_at(stamp_s)
+    turns = np.zeros(len(points), np.float32)
     if scan.duration_s > 0.0 and reference is not None and len(points):
-        points = undo_motion(points, track.poses_at(beam_stamps_s(scan)[is_return]), reference)
+        stamps_s = beam_stamps_s(scan)[is_return]
+        points = undo_motion(points, track.poses_at(stamps_s), reference)
+        turns = ((stamps_s - stamp_s) / scan.duration_s).astype(np.float32)
     is_hit = ranges[is_return] < reach_m
     ends = points.astype(np.float32)
-    hits = one_per_voxel(ends[is_hit])
+    surfels, surfel_turns = to_match(ends, is_hit, turns)
     return ScanPoints(
-        stamp_s,
-        ends,
-        is_hit,
-        thinned(with_normals(hits), MOST_SURFELS),
-        surface_points(ends, is_hit, cut),
-        scan.is_partial,
-        looks_all_round(scan.angles_rad),
-        scan.duration_s,
+        stamp_s=stamp_s,
+        points_m=ends,
+        is_hit=is_hit,
+        surfels=surfels,
+        surface_m=surface_points(ends, is_hit, cut),
+        is_partial=scan.is_partial,
+        is_all_round=looks_all_round(scan.angles_rad),
+        revolution_s=scan.duration_s,
+        ranges_m=cut,
+        turns=turns,
+        surfel_turns=surfel_turns,
     )
+
+
+def to_match(
+    ends_m: NDArray[np.float32], is_hit: NDArray[np.bool_], turns: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(M, 4) surfels and (M,) when each was measured, in revolutions."""
+    hits = np.flatnonzero(is_hit)
+    hits = hits[first_per_voxel(ends_m[hits])]
+    return thinned(with_normals(ends_m[hits]), MOST_SURFELS), thinned(turns[hits], MOST_SURFELS)
 
 
 def surface_points(ends_m: NDArray[np.float32], is_hit: NDArray[np.bool_], ranges_m: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -181,9 +210,14 @@ def beam_stamps_s(scan: LaserScan) -> NDArray[np.float64]:
 
 def one_per_voxel(points_m: NDArray[np.float32], voxel_m: float = VOXEL_M) -> NDArray[np.float32]:
     """The first point of every voxel, in beam order."""
+    return points_m[first_per_voxel(points_m, voxel_m)]
+
+
+def first_per_voxel(points_m: NDArray[np.float32], voxel_m: float = VOXEL_M) -> NDArray[np.int64]:
+    """Which points those are."""
     keys = np.floor(points_m / voxel_m).astype(np.int64)
     _, first = np.unique(keys[:, 0] * 1_000_003 + keys[:, 1], return_index=True)
-    return points_m[np.sort(first)]
+    return np.sort(first)
 
 
 def laser_position_m(options: MappingOptions, T_map_robot: SE2) -> tuple[float, float]:
