@@ -175,9 +175,8 @@ def put_state(mapper: Mapper, state: State) -> None:
         )
     mapper.rng.bit_generator.state = state["rng"]
     mapper.epoch, mapper.status = state["epoch"], MapperStatus(state["status"])
-    if "wheels.sums" in state:  # maps saved by an older program have none
-        mapper.wheels.stretch, mapper.wheels.sums = state["wheels.stretch"], state["wheels.sums"]
-        mapper.usual_fraction = state["usual_fraction"]
+    mapper.wheels.stretch, mapper.wheels.sums = state["wheels.stretch"], state["wheels.sums"]
+    mapper.usual_fraction = state["usual_fraction"]
     mapper.contradictions, mapper.confirmations_missing = state["contradictions"], state["confirmations_missing"]
     mapper.lost_since_s, mapper.last_ranges = state["lost_since_s"], state["last_ranges"]
     mapper.repeats, mapper.repeats_since_s = state["repeats"], state["repeats_since_s"]
@@ -192,7 +191,7 @@ def put_state(mapper: Mapper, state: State) -> None:
         state["keyframe_variance"],
     )
     local.scans.rows = state["scans"].view(ROW)[:, 0]
-    local.twists = TwistMeans(*state["twists"].tolist()) if "twists" in state else TwistMeans()
+    local.twists = TwistMeans(*state["twists"].tolist())
     put_filter(mapper, state)
     put_drawing(local.drawing, state)
     put_loops(local.loops, state)
