@@ -19,6 +19,16 @@ class FlatYamlError(ValueError):
     """Text that is not flat YAML: says the line."""
 
 
+def decoded(data: bytes) -> str:
+    """UTF-8, or what Windows writes: UTF-16 begins with its mark, and the letters of Latin-1 stand in comments and names only."""
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return data.decode("utf-16", "replace")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
+
+
 def parse_flat_yaml(text: str) -> dict[str, str | list[str]]:
     """Every top-level key with its value."""
     values: dict[str, str | list[str]] = {}

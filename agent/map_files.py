@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.files import write_atomically
-from agent.flat_yaml import FlatYamlError, parse_flat_yaml
+from agent.flat_yaml import FlatYamlError, decoded, parse_flat_yaml
 from agent.image_files import ImageFileError, Pixels, encode_pgm, load_image
 from protocol.geometry import SE2
 from protocol.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
@@ -111,21 +111,11 @@ def read_settings(path: Path) -> MapSettings:
             data = stream.read(MAX_YAML_BYTES + 1)
         if len(data) > MAX_YAML_BYTES or data[:2] in (b"P5", b"P2", b"\x89P"):
             raise MapFileError(f"{path}: this is no map YAML; give the .yaml file that names the image")
-        return _settings(path, parse_flat_yaml(_text(data)))
+        return _settings(path, parse_flat_yaml(decoded(data)))
     except OSError as error:
         raise MapFileError(f"{path}: {error.strerror or error}") from error
     except FlatYamlError as error:
         raise MapFileError(f"{path}: no map YAML: {error}") from error
-
-
-def _text(data: bytes) -> str:
-    """UTF-8, or what Windows writes: UTF-16 begins with its mark, and the letters of Latin-1 stand in comments and names only."""
-    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        return data.decode("utf-16", "replace")
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        return data.decode("latin-1")
 
 
 def as_saved(pixels: Pixels, settings: MapSettings) -> MapSettings:
