@@ -17,7 +17,7 @@ import math
 import struct
 import zlib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,6 +109,11 @@ class TileMap:
         side_m = TILE_CELLS * self.resolution_m
         corner = SE2(float(first[1]) * side_m, float(first[0]) * side_m, 0.0)
         return OccupancyGrid(cells, self.resolution_m, self.anchor @ corner).cropped()
+
+    def sharing(self, earlier: TileMap) -> TileMap:
+        """The same map, but what `earlier` has too is held once: of a map that grows, most tiles of most versions."""
+        old = earlier.tiles
+        return replace(self, tiles={key: old[key] if old.get(key) == tile else tile for key, tile in self.tiles.items()})
 
     def is_on_lattice_of(self, other: TileMap) -> bool:
         return self.resolution_m == other.resolution_m and self.anchor == other.anchor

@@ -14,14 +14,17 @@ class History:
         self._kept = kept
         self._maps: OrderedDict[bytes, TileMap] = OrderedDict()
 
-    def add(self, tiles: TileMap, needed: bytes = b"") -> None:
-        """Keep one more; the one that is needed goes last."""
+    def add(self, tiles: TileMap, needed: bytes = b"") -> TileMap:
+        """Keep one more, here as it is kept; the one that is needed goes last."""
+        if self.newest is not None:
+            tiles = tiles.sharing(self.newest)
         for digest in (needed, tiles.digest):
             if digest in self._maps:
                 self._maps.move_to_end(digest)
         self._maps[tiles.digest] = tiles
         while len(self._maps) > self._kept:
             self._maps.popitem(last=False)
+        return tiles
 
     def get(self, digest: bytes) -> TileMap | None:
         return self._maps.get(digest)

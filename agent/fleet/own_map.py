@@ -41,9 +41,9 @@ class OwnMap:
             return False
         revision = self.version.revision + 1 if self.version is not None and is_same_frame else 1
         self.version = MapVersion(frame, revision, tiles.digest)
-        self.tiles, self.grid, self._coarse = tiles, tiles.grid(), None
+        self.tiles = self._history.add(tiles, needed=self.pinned)
+        self.grid, self._coarse = tiles.grid(), None
         self.known_area_m2 = self.grid.known_area_m2()
-        self._history.add(tiles, needed=self.pinned)
         self._versions = {d: v for d, v in self._versions.items() if self._history.get(d)} | {tiles.digest: self.version}
         self.announcement = MapAnnouncement(
             self.robot,
