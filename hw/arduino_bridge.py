@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import re
 
-from hw.framing import Counters
+from hw.byte_window import Counters
 from hw.odometry import Quiet, TickSample, WheelGeometry
 
 BAUD_RATES = (57600, 115200)  # the sketch's own; many forks

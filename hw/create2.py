@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from hw.framing import ByteWindow, Counters, SizedFrames
+from hw.byte_window import ByteWindow, Counters
+from hw.framing import SizedFrames
 from hw.odometry import Quiet, TickSample, WheelGeometry
 
 HEADER = b"\x13"

@@ -21,7 +21,7 @@ from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-from hw.framing import Counters
+from hw.byte_window import Counters
 from hw.readings import LaserScan, Odometry
 
 Reading = LaserScan | Odometry

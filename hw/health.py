@@ -7,7 +7,7 @@ from collections import deque
 from dataclasses import dataclass
 from enum import Enum
 
-from hw.framing import Counters
+from hw.byte_window import Counters
 
 
 class DeviceState(Enum):

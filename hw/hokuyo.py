@@ -11,10 +11,10 @@ import re
 
 import numpy as np
 
+from hw.byte_window import ByteWindow
 from hw.clock import DeviceClock
 from hw.driver import Ask, Drain, DriverBase, Pause, Reading, Script, Send, SetBaud
 from hw.errors import DeviceError, DeviceSilent
-from hw.framing import ByteWindow
 from hw.readings import LaserScan
 from hw.scan_assembler import supported_only
 from hw.scip import (

@@ -9,7 +9,9 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
-from hw.framing import Bytes, ByteWindow, Counters, SizedFrames
+from hw.arrays import Bytes
+from hw.byte_window import ByteWindow, Counters
+from hw.framing import SizedFrames
 from hw.odometry import Quiet, TickSample, WheelGeometry
 from hw.rplidar_wire import xor8
 

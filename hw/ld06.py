@@ -14,8 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hw.arrays import Bytes, median
 from hw.clock import DeviceClock
-from hw.framing import Bytes, FixedFrames, Frames, median
+from hw.framing import FixedFrames, Frames
 from hw.scan_assembler import Beams
 from hw.spinning import FixedFrameLidar, carried
 

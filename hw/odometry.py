@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass
 from typing import Protocol
 
-from hw.framing import Counters
+from hw.byte_window import Counters
 from hw.readings import Odometry
 from protocol.geometry import SE2
 

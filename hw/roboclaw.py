@@ -12,7 +12,7 @@ from __future__ import annotations
 import binascii
 import struct
 
-from hw.framing import Counters
+from hw.byte_window import Counters
 from hw.odometry import Quiet, TickSample, WheelGeometry
 
 BAUD_RATES = (38400, 115200, 460800, 230400, 57600, 19200, 9600)  # 38400 is the factory's; over USB any will do

@@ -7,14 +7,15 @@ from __future__ import annotations
 
 from hw import rplidar_hq, rplidar_nodes
 from hw import rplidar_wire as wire
+from hw.arrays import Bytes, Floats, Ints
+from hw.byte_window import ByteWindow
 from hw.driver import Reading
-from hw.framing import Bytes, ByteWindow, FixedFrames
+from hw.framing import FixedFrames
 from hw.rplidar_capsule_chain import CapsuleChain
 from hw.rplidar_capsules import KINDS, frames_of, start_angles_q6
 from hw.rplidar_nodes import NodeFinder
 from hw.rplidar_start import DEFAULT_PWM, DEFAULT_RPM, RplidarStart
 from hw.scan_assembler import WITNESSES, Beams
-from hw.spinning import Floats, Ints
 
 
 class Rplidar(RplidarStart):

@@ -8,10 +8,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hw.framing import Bytes, Counters
+from hw.arrays import Bytes, Floats, Ints
+from hw.byte_window import Counters
 from hw.rplidar_capsules import CapsuleKind, start_angles_q6
 from hw.scan_assembler import Beams
-from hw.spinning import STRICT_ABOVE, Floats, Ints, carried
+from hw.spinning import STRICT_ABOVE, carried
 
 CIRCLE_Q6 = 360 * 64
 MOST_HZ = 100.0  # a capsule that spans more of the circle than this speed allows is not one

@@ -15,11 +15,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hw.framing import Bytes, FixedFrames
+from hw.arrays import Bytes, Floats, Ints
+from hw.framing import FixedFrames
 from hw.rplidar_wire import DENSE_TYPE, EXPRESS_TYPE, ULTRA_DENSE_TYPE, ULTRA_TYPE, xor8
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,9 +14,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from hw.framing import Bytes, FixedFrames
+from hw.arrays import Bytes, Floats, Ints
+from hw.framing import FixedFrames
 from hw.scan_assembler import Beams
-from hw.spinning import Floats, Ints
 
 FRAME_BYTES, BEAMS = 781, 96
 DEG_PER_COUNT = 90.0 / 16384.0

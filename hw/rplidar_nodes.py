@@ -15,9 +15,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hw.framing import Bytes, ByteWindow, Counters, Frames
+from hw.arrays import Bytes, Floats, Ints
+from hw.byte_window import ByteWindow, Counters
+from hw.framing import Frames
 from hw.scan_assembler import Beams
-from hw.spinning import Floats, Ints
 
 NODE_BYTES = 5
 TRUSTED_RUN = 4  # nodes in a row that follow from one another: by chance one in 10^7

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hw.framing import median
+from hw.arrays import Floats, median
 from hw.readings import LaserScan
 
 FULL_COVERAGE = 0.95  # issue D: below, a scan is partial and never clears free space
@@ -30,8 +30,6 @@ LONGEST_HOLE = 0.45  # share of a revolution: after a longer hole its cut cannot
 LEAST_PERIOD_S, MOST_PERIOD_S = 0.03, 2.0  # 30 turns a second to one in two
 MEMORY_TURNS, OFTEN_DIRTY = 20, 2  # a line that was damaged in two turns of twenty is not clean
 MAX_BEAMS = 20000  # a stuck motor turns no more: its revolution never ends
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

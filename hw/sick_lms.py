@@ -8,9 +8,10 @@ from __future__ import annotations
 import numpy as np
 
 from hw import sick_wire as wire
+from hw.byte_window import ByteWindow
 from hw.driver import Ask, Drain, DriverBase, Pause, Reading, Script, Send, SetBaud
 from hw.errors import DeviceSilent
-from hw.framing import ByteWindow, SizedFrames
+from hw.framing import SizedFrames
 from hw.readings import LaserScan
 from hw.scan_assembler import supported_only
 from hw.suspicion import Suspicion

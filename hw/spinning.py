@@ -12,12 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hw.arrays import Bytes, Floats, Ints
+from hw.byte_window import ByteWindow
 from hw.driver import DriverBase, Reading
-from hw.framing import Bytes, ByteWindow, FixedFrames, Frames, SizedFrames
+from hw.framing import FixedFrames, Frames, SizedFrames
 from hw.scan_assembler import Beams, ScanAssembler
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 PACE_S = 1.0  # over how long the true rate of bytes is measured
 PACE_GAP_S = 0.2  # a longer silence is no pace

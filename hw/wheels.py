@@ -13,7 +13,7 @@ import binascii
 import struct
 from dataclasses import dataclass, field
 
-from hw.framing import Counters
+from hw.byte_window import Counters
 from hw.odometry import Quiet, TickSample, WheelGeometry
 
 BAUD_RATES = (115200,)

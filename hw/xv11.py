@@ -20,8 +20,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hw.arrays import Bytes
 from hw.driver import Drain, Script, Send
-from hw.framing import Bytes, FixedFrames, Frames
+from hw.framing import FixedFrames, Frames
 from hw.scan_assembler import Beams
 from hw.spinning import FixedFrameLidar
 

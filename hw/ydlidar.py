@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hw import ydlidar_wire as wire
+from hw.arrays import Bytes, Floats, Ints, median
 from hw.driver import Ask, Drain, Pause, Reading, Script, Send, SetLines
 from hw.errors import DeviceError, DeviceSilent
-from hw.framing import Bytes, Frames, SizedFrames, median
+from hw.framing import Frames, SizedFrames
 from hw.rplidar_wire import Descriptor, xor8
 from hw.scan_assembler import Beams
-from hw.spinning import Floats, Ints, SpinningLidar, carried
+from hw.spinning import SpinningLidar, carried
 from hw.ydlidar_wire import HEAD_BYTES, HEADER, MODELS, MOST_SAMPLES
 
 MOST_STEP_DEG = 3.0  # X2 at 3 kHz and 12 Hz: 1.44; a packet that spans more ran backwards or is damaged

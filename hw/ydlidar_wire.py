@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hw.arrays import Floats
 from hw.rplidar_wire import Descriptor, xor8
-from hw.spinning import Floats
 
 HEADER = b"\xaa\x55"
 CLOCK_HEADER = b"\xaa\x66"

@@ -6,7 +6,7 @@ import math
 import struct
 
 from hw import kobuki
-from hw.framing import ByteWindow, Counters
+from hw.byte_window import ByteWindow, Counters
 from hw.sim.bases_sim import Counting, Streaming
 
 HARDWARE, FIRMWARE, UNIQUE_ID = (1, 0, 4), (1, 2, 0), (0x30414B55, 0x4B4F4255, 0x00000001)

@@ -6,7 +6,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hw.framing import ByteWindow, Counters, FixedFrames, SizedFrames
+from hw.byte_window import ByteWindow, Counters
+from hw.framing import FixedFrames, SizedFrames
 
 LENGTH = 6
 
