@@ -48,7 +48,7 @@ def doubts(ours: Witness, theirs: Witness, pose: NDArray[np.float64]) -> Doubts:
 
 def _counted(points: Witness, on: Witness, poses: NDArray[np.float64]) -> NDArray[np.int64]:
     """(8,) points of one map, seen by the other: what `doubts` adds up, and last the largest piece of long wall."""
-    kinds, outcome = points.kinds, _outcome(points, on, poses)
+    kinds, outcome = points.kinds, outcome_on(points, on, poses)
     agrees, conflicts = outcome == AGREES, outcome == CONFLICTS
     deep = np.flatnonzero(conflicts)
     x, y = placed(points.probe.xy1[:, deep], poses, on.field.resolution_m)
@@ -66,7 +66,7 @@ def _counted(points: Witness, on: Witness, poses: NDArray[np.float64]) -> NDArra
     return np.array([*map(np.count_nonzero, all_of), _largest_piece(points.thin.positions_m[deep[kinds[deep] == LONG]])])
 
 
-def _outcome(points: Witness, on: Witness, poses: NDArray[np.float64]) -> NDArray[np.uint8]:
+def outcome_on(points: Witness, on: Witness, poses: NDArray[np.float64]) -> NDArray[np.uint8]:
     """(P,) what the map says to every point."""
     return np.asarray(OUTCOMES.take(readings(on.field.fine, on.field.resolution_m, points.probe, poses))[0])
 
@@ -90,7 +90,7 @@ def turning(ours: Witness, theirs: Witness, pose: NDArray[np.float64]) -> float:
     """
     least = math.inf
     for points, on, T in ((theirs, ours, pose[None]), (ours, theirs, inverted(pose[None]))):
-        agrees = _outcome(points, on, T) == AGREES
+        agrees = outcome_on(points, on, T) == AGREES
         n, at = (values[agrees].astype(np.float64) for values in (points.thin.normals, points.thin.positions_m))
         if not len(n):
             return 0.0

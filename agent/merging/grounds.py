@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from agent.features.snapshot import MapSnapshot
 from agent.merging.doubts import doubts, turning
 from agent.merging.result import MatchFactor
+from agent.merging.sharpness import sharpness
 from agent.merging.transforms import Poses
 from agent.merging.validation import evidence, match_factor
 from agent.merging.verdict import Grounds, rival_score
@@ -33,5 +34,6 @@ def weighed(
         max(ours.working.resolution_m, theirs.working.resolution_m),
         *doubts(witness(ours), witness(theirs), poses[best]),
         turning(witness(ours), witness(theirs), poses[best]),
+        *sharpness(witness(ours), witness(theirs), poses[best]),
     )
     return grounds, factor, overlap_m2, found.score_m, order

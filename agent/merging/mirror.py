@@ -15,11 +15,13 @@ from agent.merging.search import FIRST_PASS, search
 from agent.merging.verdict import Grounds
 from protocol.grid import OccupancyGrid
 
-MIN_SHARE = 0.8  # of the score at hand: a reflection with less wall than this says nothing,
+MIN_SHARE = 0.5  # of the score at hand: a reflection with less wall than this says nothing,
 DOUBTFUL = 1.0  # unless the fit at hand is this suspicious; then
 MIN_SHARE_IN_DOUBT = 0.3  # says enough
-MIN_LESS_SUSPICION = 0.3  # recordings and their mirror images differ by 0.6 and more, true pairs by 0.15 at most
-FAR_BETTER = 1.5  # times the score at hand: reflections that fit so much better are 0.4 and more in doubt where the pair is true
+MIN_LESS_SUSPICION = (
+    0.3  # recordings and their mirror images differ by 0.6 and more, true pairs that reflect so well by 0.1 at most
+)
+BETTER = 1.1  # times the score at hand: reflections that fit so much better are in more doubt, by 0.4, where the pair is true
 
 
 def is_mirror_image(ours: MapSnapshot, theirs: MapSnapshot, grounds: Grounds) -> bool:
@@ -32,7 +34,7 @@ def is_mirror_image(ours: MapSnapshot, theirs: MapSnapshot, grounds: Grounds) ->
         return False
     reflection = weighed(ours, turned, poses)[0]
     share = MIN_SHARE if grounds.suspicion < DOUBTFUL else MIN_SHARE_IN_DOUBT
-    less = 0.0 if reflection.score > FAR_BETTER * grounds.score else MIN_LESS_SUSPICION
+    less = 0.0 if reflection.score > BETTER * grounds.score else MIN_LESS_SUSPICION
     return reflection.score > share * grounds.score and reflection.suspicion < grounds.suspicion - less
 
 

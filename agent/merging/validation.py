@@ -48,6 +48,7 @@ class Evidence:
 class Witness:
     """What judging needs of one map."""
 
+    walls: WallPoints  # all of them, as the field numbers them
     thin: WallPoints
     kinds: NDArray[np.uint8]
     probe: Probe

@@ -37,6 +37,9 @@ STRETCH_PER_ASTRAY = 0.25  # and 0.105 among plants, where things astray tell th
 STRANGE_M, FAMILIAR_M = 1.0, 1.0  # things that stand elsewhere, and things that stand where they should
 ROUND_M = 16.0  # so much wall, of which
 ROUND_SHARE = 0.28  # less than this says how the maps are turned, is a round hall or racking: its ends merged up to 0.27
+BLURRED_M, BLURRED = 0.07, 2.75  # no true pair has small things so far off, and so much farther than long walls, unless it is
+BLURRED_MARGIN_M = 60.0  # this far ahead; desks of other classrooms are off by 9 to 11 cm, 3.6 to 4.2 times as far as the walls
+ACCIDENT_M = 0.105  # long walls of grave suspicion this far off lie on others: by accident 0.14, true ones 0.10 at most
 REPEATED_SHARE, REPEATED_M = 0.6, 24.0  # a rival of this share of the score and so much wall is no accident
 
 
@@ -59,6 +62,8 @@ class Grounds:
     loose_m: float  # free-standing things that agree,
     astray_m: float  # and those deep in the other map's free space
     turning_m: float  # agreeing wall that says how the maps are turned
+    long_error_m: float  # how far long walls that agree lie apart,
+    small_error_m: float  # and what is no long wall
 
     @property
     def suspicion(self) -> float:
@@ -99,7 +104,7 @@ def verdict(grounds: Grounds, options: MatchOptions) -> tuple[MatchStatus, str]:
         return MatchStatus.AMBIGUOUS, Reason.RIVAL
     is_bare = g.distinct_m < MIN_DISTINCT_M and g.score - g.rival < CLEAR_MARGIN_M
     grave_m = options.min_margin_m + MARGIN_PER_GRAVE_SUSPICION_M * (g.suspicion - GRAVE_SUSPICION)
-    is_doubtful = g.is_refuted or is_bare or g.score - g.rival <= grave_m or _is_crossed(g)
+    is_doubtful = g.is_refuted or is_bare or g.score - g.rival <= grave_m or _is_crossed(g) or _is_blurred(g)
     if is_doubtful or _is_one_of_many(g, options) or _is_one_of_a_few(g, options):
         return MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE
     return MatchStatus.MERGED, Reason.MATCHED
@@ -108,6 +113,13 @@ def verdict(grounds: Grounds, options: MatchOptions) -> tuple[MatchStatus, str]:
 def _is_crossed(g: Grounds) -> bool:
     """Whether a wall of one map crosses the other's free space, longer than a door: two warehouses with the same racks."""
     return g.stretch_m > max(STRETCH_M, STRETCH_SHARE * g.agreeing_m + STRETCH_PER_ASTRAY * g.astray_m)
+
+
+def _is_blurred(g: Grounds) -> bool:
+    """Whether things lie on things like them, not on the same: small ones far less sharply than long walls, or long walls too."""
+    bar_m = max(BLURRED_M, BLURRED * g.long_error_m)
+    is_like = g.small_error_m > bar_m and g.score - g.rival < BLURRED_MARGIN_M
+    return is_like or (g.long_error_m > ACCIDENT_M and g.suspicion > GRAVE_SUSPICION)
 
 
 def _is_one_of_many(g: Grounds, options: MatchOptions) -> bool:

@@ -35,4 +35,4 @@ def search_worth(snapshot: MapSnapshot) -> NDArray[np.float32]:
 
 def _witness(s: MapSnapshot) -> Witness:
     points = Probe.of(s.thin_walls, s.thin_kinds)
-    return Witness(s.thin_walls, s.thin_kinds, points, s.field, worth_table(DECISION_WORTH, s.field))
+    return Witness(s.walls, s.thin_walls, s.thin_kinds, points, s.field, worth_table(DECISION_WORTH, s.field))

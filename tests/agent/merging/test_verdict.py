@@ -25,6 +25,8 @@ GOOD = Grounds(
     loose_m=5.0,
     astray_m=0.5,
     turning_m=20.0,
+    long_error_m=0.04,
+    small_error_m=0.05,
 )
 # what two parts of a building had to say for each other, one of them turned over
 MIRRORED_PARTS = {"score": 22.6, "rival": 2.6, "factor": 0.94, "attached_doubt": 0.29, "deep_doubt": 0.08}
@@ -78,6 +80,9 @@ RACKS = {
 # two rooms of one rotunda, furnished each in its own way, and two classrooms
 ROOMS = {"score": 18.6, "rival": 7.1, "agreeing_m": 27.4, "deep_doubt": 0.0, "loose_m": 0.3, "astray_m": 1.3}
 CLASSROOMS = {"score": 41.0, "rival": 20.65, "deep_doubt": 0.0, "loose_m": 14.4, "astray_m": 2.0}
+# desks beside desks, while the long walls lie on each other; and long walls that do not, of a map that is turned over
+DESKS = {"score": 47.1, "rival": 13.4, "long_error_m": 0.028, "small_error_m": 0.104}
+BESIDE = {"factor": 0.91, "attached_doubt": 0.2, "deep_doubt": 0.05, "long_error_m": 0.126}
 
 
 def test_good_grounds_merge() -> None:
@@ -104,6 +109,11 @@ def test_a_near_rival_does_not_hurt_what_is_flawless() -> None:
         CLASSROOMS | {"loose_m": 30.0},  # a park
         CLASSROOMS | {"rival": 12.5},
         CLASSROOMS | {"score": 60.7},
+        DESKS | {"small_error_m": 0.075},
+        DESKS | {"long_error_m": 0.04},  # a bent map
+        DESKS | {"score": 80.0},
+        BESIDE | {"long_error_m": 0.09},
+        BESIDE | {"factor": 0.96},
     ],
 )
 def test_what_changes_in_a_place_does_not_hurt(change: dict[str, float]) -> None:
@@ -141,6 +151,8 @@ def test_little_but_long_walls_must_be_less_suspicious() -> None:
         (RACKS, MatchStatus.AMBIGUOUS, Reason.RIVAL),
         (ROOMS, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
         (CLASSROOMS, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
+        (DESKS, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
+        (BESIDE, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
         (HOTEL, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
         (MIRRORED_PARTS, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
     ],
