@@ -39,6 +39,7 @@ ROUND_M = 16.0  # so much wall, of which
 ROUND_SHARE = 0.28  # less than this says how the maps are turned, is a round hall or racking: its ends merged up to 0.27
 BLURRED_M, BLURRED = 0.07, 2.75  # no true pair has small things so far off, and so much farther than long walls, unless it is
 BLURRED_MARGIN_M = 60.0  # this far ahead; desks of other classrooms are off by 9 to 11 cm, 3.6 to 4.2 times as far as the walls
+ANYHOW_M = 0.1  # small things this far off, indoors: true pairs with a rival and without a clear margin stay below 0.09
 ACCIDENT_M = 0.105  # long walls of grave suspicion this far off lie on others: by accident 0.14, true ones 0.10 at most
 REPEATED_SHARE, REPEATED_M = 0.6, 24.0  # a rival of this share of the score and so much wall is no accident
 
@@ -75,6 +76,11 @@ class Grounds:
         """
         factor = self.factor + FACTOR_SLOPE * max(0.0, self.cell_m - 0.1)
         return 13.0 * (USUAL_FACTOR - factor) + math.sqrt(min(self.attached_doubt, 0.5)) + 1.6 * math.sqrt(self.deep_doubt)
+
+    @property
+    def is_indoors(self) -> bool:
+        """Whether little of what there is stands free: in the open things come and go."""
+        return self.loose_m + self.astray_m < INDOOR_SHARE * self.agreeing_m
 
     @property
     def is_refuted(self) -> bool:
@@ -131,9 +137,8 @@ def _is_one_of_many(g: Grounds, options: MatchOptions) -> bool:
     share = g.rival / g.score
     if share <= options.near_rival_share:
         return False
-    is_indoors = g.loose_m + g.astray_m < INDOOR_SHARE * g.agreeing_m
     is_odd = g.astray_m + g.deep_doubt * g.agreeing_m > ODD_M and g.score - g.rival < ODD_MARGIN_M
-    is_flawed = (is_indoors and is_odd) or (share > FLAWED_SHARE and g.deep_doubt > FLAW)
+    is_flawed = (g.is_indoors and is_odd) or (share > FLAWED_SHARE and g.deep_doubt > FLAW)
     return is_flawed or (share > REPEATED_SHARE and g.rival > REPEATED_M)
 
 
@@ -141,12 +146,15 @@ def _is_one_of_a_few(g: Grounds, options: MatchOptions) -> bool:
     """Whether there is some other place, and what would tell it from this one does not agree.
 
     Two ends of a rotunda agree along its round walls, however they are turned, and walls between its rooms fall on each other
-    by accident.  Two of its rooms agree in every wall, and in nothing that stands in them.
+    by accident.  Two of its rooms agree in every wall, and in nothing that stands in them.  Cars in two ends of a garage
+    stand beside each other, as near as accident puts them.
     """
     if g.rival <= options.some_rival_share * g.score:
         return False
-    is_round = g.agreeing_m >= ROUND_M and g.turning_m <= ROUND_SHARE * g.agreeing_m and g.score - g.rival < CLEAR_MARGIN_M
-    return is_round or (g.astray_m > STRANGE_M and g.loose_m < FAMILIAR_M)
+    is_round = g.agreeing_m >= ROUND_M and g.turning_m <= ROUND_SHARE * g.agreeing_m
+    is_anyhow = g.is_indoors and g.small_error_m > ANYHOW_M
+    is_clear = g.score - g.rival >= CLEAR_MARGIN_M
+    return (not is_clear and (is_round or is_anyhow)) or (g.astray_m > STRANGE_M and g.loose_m < FAMILIAR_M)
 
 
 def _needed_margin_m(g: Grounds, options: MatchOptions) -> float:

@@ -81,6 +81,15 @@ RACKS = {
 ROOMS = {"score": 18.6, "rival": 7.1, "agreeing_m": 27.4, "deep_doubt": 0.0, "loose_m": 0.3, "astray_m": 1.3}
 CLASSROOMS = {"score": 41.0, "rival": 20.65, "deep_doubt": 0.0, "loose_m": 14.4, "astray_m": 2.0}
 # desks beside desks, while the long walls lie on each other; and long walls that do not, of a map that is turned over
+CARS = {
+    "score": 25.6,
+    "rival": 5.2,
+    "agreeing_m": 35.9,
+    "loose_m": 2.8,
+    "astray_m": 0.2,
+    "small_error_m": 0.108,
+    "long_error_m": 0.077,
+}
 DESKS = {"score": 47.1, "rival": 13.4, "long_error_m": 0.028, "small_error_m": 0.104}
 BESIDE = {"factor": 0.91, "attached_doubt": 0.2, "deep_doubt": 0.05, "long_error_m": 0.126}
 
@@ -110,6 +119,10 @@ def test_a_near_rival_does_not_hurt_what_is_flawless() -> None:
         CLASSROOMS | {"rival": 12.5},
         CLASSROOMS | {"score": 60.7},
         DESKS | {"small_error_m": 0.075},
+        CARS | {"small_error_m": 0.09},
+        CARS | {"rival": 3.5},  # no other place
+        CARS | {"score": 31.0},
+        CARS | {"loose_m": 15.0},  # a park
         DESKS | {"long_error_m": 0.04},  # a bent map
         DESKS | {"score": 80.0},
         BESIDE | {"long_error_m": 0.09},
@@ -151,6 +164,7 @@ def test_little_but_long_walls_must_be_less_suspicious() -> None:
         (RACKS, MatchStatus.AMBIGUOUS, Reason.RIVAL),
         (ROOMS, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
         (CLASSROOMS, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
+        (CARS, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
         (DESKS, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
         (BESIDE, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
         (HOTEL, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
