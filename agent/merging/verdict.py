@@ -78,6 +78,11 @@ class Grounds:
         return 13.0 * (USUAL_FACTOR - factor) + math.sqrt(min(self.attached_doubt, 0.5)) + 1.6 * math.sqrt(self.deep_doubt)
 
     @property
+    def deep_m(self) -> float:
+        """Straight wall deep in the other map's free space."""
+        return self.deep_doubt * self.agreeing_m
+
+    @property
     def is_indoors(self) -> bool:
         """Whether little of what there is stands free: in the open things come and go."""
         return self.loose_m + self.astray_m < INDOOR_SHARE * self.agreeing_m
@@ -137,7 +142,7 @@ def _is_one_of_many(g: Grounds, options: MatchOptions) -> bool:
     share = g.rival / g.score
     if share <= options.near_rival_share:
         return False
-    is_odd = g.astray_m + g.deep_doubt * g.agreeing_m > ODD_M and g.score - g.rival < ODD_MARGIN_M
+    is_odd = g.astray_m + g.deep_m > ODD_M and g.score - g.rival < ODD_MARGIN_M
     is_flawed = (g.is_indoors and is_odd) or (share > FLAWED_SHARE and g.deep_doubt > FLAW)
     return is_flawed or (share > REPEATED_SHARE and g.rival > REPEATED_M)
 
@@ -147,14 +152,14 @@ def _is_one_of_a_few(g: Grounds, options: MatchOptions) -> bool:
 
     Two ends of a rotunda agree along its round walls, however they are turned, and walls between its rooms fall on each other
     by accident.  Two of its rooms agree in every wall, and in nothing that stands in them.  Cars in two ends of a garage
-    stand beside each other, as near as accident puts them.
+    stand beside each other, as near as accident puts them, or a wall where there is none.
     """
     if g.rival <= options.some_rival_share * g.score:
         return False
     is_round = g.agreeing_m >= ROUND_M and g.turning_m <= ROUND_SHARE * g.agreeing_m
-    is_anyhow = g.is_indoors and g.small_error_m > ANYHOW_M
+    is_odd = g.is_indoors and (g.deep_m > ODD_M or g.small_error_m > ANYHOW_M)
     is_clear = g.score - g.rival >= CLEAR_MARGIN_M
-    return (not is_clear and (is_round or is_anyhow)) or (g.astray_m > STRANGE_M and g.loose_m < FAMILIAR_M)
+    return (not is_clear and (is_round or is_odd)) or (g.astray_m > STRANGE_M and g.loose_m < FAMILIAR_M)
 
 
 def _needed_margin_m(g: Grounds, options: MatchOptions) -> float:

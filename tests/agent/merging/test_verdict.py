@@ -165,6 +165,7 @@ def test_little_but_long_walls_must_be_less_suspicious() -> None:
         (ROOMS, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
         (CLASSROOMS, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
         (CARS, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
+        (CARS | {"small_error_m": 0.05, "deep_doubt": 0.05}, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
         (DESKS, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
         (BESIDE, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
         (HOTEL, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
