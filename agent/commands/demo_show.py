@@ -8,7 +8,7 @@ import shutil
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from protocol.geometry import SE2
 from protocol.grid import OccupancyGrid
 
 LOOK_EVERY_S = 0.5
+SAY_EVERY_S = 5.0  # where lines stay
 
 
 class Show:
@@ -29,6 +30,7 @@ class Show:
         self.args, self.fleet = args, fleet
         self.merged_after_s: float | None = None
         self.statuses: list[dict[str, Any]] = []
+        self.said_s = -SAY_EVERY_S
         if not args.quiet:
             print(f"{len(fleet.agents)} robots are up; the page: {fleet.page}", file=sys.stderr)
 
@@ -60,7 +62,8 @@ class Show:
             return
         if sys.stderr.isatty():
             print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
-        elif int(elapsed_s / LOOK_EVERY_S) % 10 == 0:
+        elif elapsed_s - self.said_s >= SAY_EVERY_S:
+            self.said_s = elapsed_s
             print(line, file=sys.stderr, flush=True)
 
     def finish(self) -> Figures:
@@ -93,7 +96,7 @@ class Show:
         if truth is not None:
             root = self.fleet.stage.start_pose(best["root"])
             T_world_global = aligned(fused, truth, root) if root is not None else None
-        global_poses = self.poses_global()
+        global_poses = self.poses_global(best)
         title = f"{len(best['group'])} robots, one map of {fused.known_area_m2():.0f} m2"
         (out / "merged.png").write_bytes(png(map_picture(fused, global_poses, title)))
         return Figures(
@@ -104,7 +107,7 @@ class Show:
             known_m2=fused.known_area_m2(),
             conflicting_cells=best["global"]["conflicting_cells"] if best["global"] else 0,
             agreement=agreement(fused, truth, T_world_global) if truth is not None and T_world_global is not None else None,
-            pose_errors_m=self.pose_errors(T_world_global, best["group"]),
+            pose_errors_m=self.pose_errors(T_world_global, global_poses),
             scans=self.scans()[0],
             scans_lost=self.scans()[1],
         )
@@ -117,23 +120,26 @@ class Show:
     def fused(self, robot: str) -> OccupancyGrid | None:
         return next(agent for agent in self.fleet.agents if agent.robot == robot).grid()
 
-    def poses_global(self) -> dict[str, SE2]:
-        """Every robot as it sees itself: its own frame in the fleet's, and its own pose."""
-        return {
-            s["robot"]: SE2(*s["frames"][s["robot"]]) @ SE2(*s["mapping"]["pose"])
-            for s in self.statuses
-            if s["group"] and s["robot"] in s["frames"] and "pose" in s["mapping"]
-        }
+    def poses_global(self, best: Mapping[str, Any]) -> dict[str, SE2]:
+        """Every robot of the best one's group as it sees itself: its frame in the fleet's, and its own pose.
 
-    def pose_errors(self, T_world_global: SE2 | None, group: Sequence[str]) -> dict[str, float]:
-        """Where each robot of the group believes to be in the fleet's map, against where it was at that very moment."""
+        A robot that has just lost sight of the others has another fleet's frame; where its map lies, the best one says.
+        """
+        poses = {}
+        for s in self.statuses:
+            frames = s["frames"] if s["root"] == best["root"] else best["frames"]
+            if s["robot"] in best["group"] and s["robot"] in frames and "pose" in s["mapping"]:
+                poses[s["robot"]] = SE2(*frames[s["robot"]]) @ SE2(*s["mapping"]["pose"])
+        return poses
+
+    def pose_errors(self, T_world_global: SE2 | None, poses: Mapping[str, SE2]) -> dict[str, float]:
+        """Where each robot believes to be in the fleet's map, against where it was at that very moment."""
         if T_world_global is None:
             return {}
         errors = {}
-        poses = self.poses_global()
         for s in self.statuses:
             was = self.fleet.stage.pose_at(s["robot"], s["mapping"].get("pose_stamp_s", 0.0))
-            if was is not None and s["robot"] in poses and s["robot"] in group:
+            if was is not None and s["robot"] in poses:
                 errors[s["robot"]] = was.distance_m(T_world_global @ poses[s["robot"]])
         return errors
 
