@@ -24,8 +24,8 @@ FACTOR_SLOPE = 0.3  # coarser cells disagree more at the truth, by this a metre 
 MAX_SUSPICION = 1.4  # true pairs of bent maps reach 1.6
 MARGIN_PER_SUSPICION_M = 6.5
 MARGIN_PER_BARE_SUSPICION_M = 12.0  # where little else than long walls agrees: ends of a plan merged wrongly up to 11 a unit
-GRAVE_SUSPICION = 0.8  # few true pairs look worse, and those that do are far ahead of any rival;
-MARGIN_PER_GRAVE_SUSPICION_M = 45.0  # mirrored parts of a building at 1.2 were ahead by 20 m
+GRAVE_SUSPICION = 0.85  # few true pairs look worse, and those that do are far ahead of any rival;
+MARGIN_PER_GRAVE_SUSPICION_M = 70.0  # two warehouses at 1.2 were ahead by 29 m, mirrored parts of a building by 20
 MIN_DISTINCT_M = 4.0  # two ends of a building share long walls; what tells them apart is short,
 CLEAR_MARGIN_M = 25.0  # unless nothing else comes near: ends that were merged wrongly were ahead by 7 to 13 m
 FLAWED_SHARE, FLAW = 0.45, 0.002  # a rival of this share of the score, and of `deep_doubt` more than none
@@ -35,6 +35,7 @@ DEEP_ALONE = 2.0  # doubt per root of `deep_doubt`; true pairs keep their margin
 STRETCH_M, STRETCH_SHARE = 3.0, 0.06  # of one wall in the open: true pairs reach 0.065 of what agrees among cars,
 STRETCH_PER_ASTRAY = 0.25  # and 0.105 among plants, where things astray tell that little fits better
 STRANGE_M, FAMILIAR_M = 1.0, 1.0  # things that stand elsewhere, and things that stand where they should
+MIN_TURNING_M = 1.5  # of wall that says how the maps are turned: less is an accident, true pairs have 2.9 and more
 ROUND_M = 16.0  # so much wall, of which
 ROUND_SHARE = 0.28  # less than this says how the maps are turned, is a round hall or racking: its ends merged up to 0.27
 BLURRED_M, BLURRED = 0.07, 2.75  # no true pair has small things so far off, and so much farther than long walls, unless it is
@@ -109,7 +110,8 @@ def verdict(grounds: Grounds, options: MatchOptions) -> tuple[MatchStatus, str]:
         return MatchStatus.NO, Reason.CONFLICTS
     if g.factor < options.min_match_factor:
         return MatchStatus.NO, Reason.LOW_MATCH_FACTOR
-    if g.observability_m <= max(options.min_observability_m, options.min_observable_share * g.agreeing_m):
+    is_fixed = g.observability_m > max(options.min_observability_m, options.min_observable_share * g.agreeing_m)
+    if not is_fixed or g.turning_m < MIN_TURNING_M:
         return MatchStatus.AMBIGUOUS, Reason.UNOBSERVABLE
     if g.score - g.rival <= _needed_margin_m(g, options) or g.rival >= options.max_rival_share * g.score:
         return MatchStatus.AMBIGUOUS, Reason.RIVAL

@@ -68,6 +68,15 @@ WAREHOUSES = {
     "stretch_m": 16.8,
     "astray_m": 4.4,
 }
+ALIKE = {
+    "score": 34.2,
+    "rival": 5.6,
+    "agreeing_m": 131.0,
+    "against_m": 45.8,
+    "factor": 0.957,
+    "attached_doubt": 0.81,
+    "deep_doubt": 0.13,
+}
 RACKS = {
     "score": 15.0,
     "rival": 2.75,
@@ -91,7 +100,7 @@ CARS = {
     "long_error_m": 0.077,
 }
 DESKS = {"score": 47.1, "rival": 13.4, "long_error_m": 0.028, "small_error_m": 0.104}
-BESIDE = {"factor": 0.91, "attached_doubt": 0.2, "deep_doubt": 0.05, "long_error_m": 0.126}
+BESIDE = {"factor": 0.93, "attached_doubt": 0.2, "deep_doubt": 0.05, "long_error_m": 0.126}
 
 
 def test_good_grounds_merge() -> None:
@@ -153,6 +162,7 @@ def test_little_but_long_walls_must_be_less_suspicious() -> None:
         ({"factor": 0.84}, MatchStatus.NO, Reason.LOW_MATCH_FACTOR),
         ({"observability_m": 1.5}, MatchStatus.AMBIGUOUS, Reason.UNOBSERVABLE),
         ({"observability_m": 4.0}, MatchStatus.AMBIGUOUS, Reason.UNOBSERVABLE),
+        ({"turning_m": 0.8}, MatchStatus.AMBIGUOUS, Reason.UNOBSERVABLE),
         ({"rival": 35.0}, MatchStatus.AMBIGUOUS, Reason.RIVAL),
         ({"rival": 30.0}, MatchStatus.AMBIGUOUS, Reason.RIVAL),
         ({"distinct_m": 3.5, "score": 24.0}, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
@@ -161,6 +171,7 @@ def test_little_but_long_walls_must_be_less_suspicious() -> None:
         ({"rival": 26.0, "deep_doubt": 0.0}, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
         (ROTUNDA, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
         (WAREHOUSES, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
+        (ALIKE, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
         (RACKS, MatchStatus.AMBIGUOUS, Reason.RIVAL),
         (ROOMS, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
         (CLASSROOMS, MatchStatus.AMBIGUOUS, Reason.LOOK_ALIKE),
