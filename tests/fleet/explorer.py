@@ -98,10 +98,15 @@ def judged(ours: OccupancyGrid, theirs: OccupancyGrid, T: SE2) -> MergeResult:
 
 
 def _walls_meet(ours: OccupancyGrid, theirs: OccupancyGrid, T: SE2) -> bool:
-    """Whether most of their walls that fall on known cells of ours lie within a cell of a wall."""
+    """Whether most of their walls that fall on known cells of ours lie within a cell of a wall, and nearly half on it.
+
+    By accident 19 of 19 lay within a cell of a wall, and a third on it; of one place 75 % lie on it, and hardly ever below 45 %.
+    """
     points_m = T.apply(theirs.points_of(np.argwhere(theirs.cells == OCCUPIED)))
     step = ours.resolution_m
     around = [(dx, dy) for dx in (-step, 0.0, step) for dy in (-step, 0.0, step)]
     near = np.any([ours.values_at(points_m + np.array(offset)) == OCCUPIED for offset in around], axis=0)
-    known = ours.values_at(points_m) != UNKNOWN
-    return bool(np.count_nonzero(near & known) >= max(8, 0.8 * np.count_nonzero(known)))
+    there = ours.values_at(points_m)
+    known = np.count_nonzero(there != UNKNOWN)
+    near &= there != UNKNOWN
+    return bool(np.count_nonzero(near) >= max(8, 0.8 * known) and np.count_nonzero(there == OCCUPIED) >= 0.45 * known)

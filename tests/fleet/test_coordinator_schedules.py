@@ -8,8 +8,8 @@ from tests.fleet.departures import run_departure
 from tests.fleet.schedules import run_schedule
 
 
-# 665, 7455: where a robot began anew, its old place fits by chance; 3231, 4510: judged on facts that changed since
-@pytest.mark.parametrize("seed", [*range(24), 665, 3231, 4510, 7455])
+# 665, 7455, 710732: where a robot began anew, its old place fits by chance; 3231, 4510: judged on facts that changed since
+@pytest.mark.parametrize("seed", [*range(24), 665, 3231, 4510, 7455, 710732])
 def test_the_invariants_hold_whatever_breaks(seed: int) -> None:
     outcome = run_schedule(seed)
     assert outcome.wrong_edges == 0
