@@ -18,10 +18,8 @@ from protocol.grid import OccupancyGrid
 MIN_SHARE = 0.5  # of the score at hand: a reflection with less wall than this says nothing,
 DOUBTFUL = 1.0  # unless the fit at hand is this suspicious; then
 MIN_SHARE_IN_DOUBT = 0.3  # says enough
-MIN_LESS_SUSPICION = (
-    0.3  # recordings and their mirror images differ by 0.6 and more, true pairs that reflect so well by 0.1 at most
-)
-BETTER = 1.1  # times the score at hand: reflections that fit so much better are in more doubt, by 0.4, where the pair is true
+MIN_LESS_SUSPICION = 0.3  # recordings and their images differ by 0.6, true pairs that reflect so well by 0.1 at most; but
+AS_WELL, LESS_SUSPICION = 0.9, 0.06  # a reflection with nearly the score at hand is never less suspicious by 0.05 of a true pair
 
 
 def is_mirror_image(ours: MapSnapshot, theirs: MapSnapshot, grounds: Grounds) -> bool:
@@ -34,7 +32,7 @@ def is_mirror_image(ours: MapSnapshot, theirs: MapSnapshot, grounds: Grounds) ->
         return False
     reflection = weighed(ours, turned, poses)[0]
     share = MIN_SHARE if grounds.suspicion < DOUBTFUL else MIN_SHARE_IN_DOUBT
-    less = 0.0 if reflection.score > BETTER * grounds.score else MIN_LESS_SUSPICION
+    less = LESS_SUSPICION if reflection.score > AS_WELL * grounds.score else MIN_LESS_SUSPICION
     return reflection.score > share * grounds.score and reflection.suspicion < grounds.suspicion - less
 
 
