@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from agent.features.corners import Corners
 from agent.features.signatures import Signatures
+from agent.merging.blas import one_thread
 from agent.merging.transforms import Poses, angle_between, no_poses, taking
 
 MAX_CORNER_PAIRS = 1500
@@ -26,7 +27,8 @@ def signature_candidates(
     """The best-matching places of ours for every telling place of theirs, turned to agree with the walls where near."""
     if not len(ours) or not len(theirs.queries):
         return no_poses()
-    alike = _likeness(theirs, ours)
+    with one_thread():
+        alike = _likeness(theirs, ours)
     best = min(targets_per_query, alike.shape[1])
     targets = np.argpartition(-alike, best - 1, axis=1)[:, :best].ravel()
     queries = np.repeat(np.arange(len(theirs.queries)), best)
