@@ -104,8 +104,10 @@ class Network:
     def __exit__(self, *_: object) -> None:
         for cable in self.cables:
             self._run(cable.remove())
+        self._run(_all_ended())
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(5.0)
+        self._loop.close()
 
     def cable(self, target: str) -> Cable:
         """A new cable that leads to `target`."""
@@ -119,3 +121,11 @@ class Network:
 
     def _run(self, work: Coroutine[Any, Any, T]) -> T:
         return asyncio.run_coroutine_threadsafe(work, self._loop).result(10.0)
+
+
+async def _all_ended() -> None:
+    """What still carries bytes, or waits for a slow line, is told to stop, and has stopped."""
+    others = asyncio.all_tasks() - {asyncio.current_task()}
+    for task in others:
+        task.cancel()
+    await asyncio.gather(*others, return_exceptions=True)
