@@ -66,6 +66,15 @@ class OccupancyGrid:
         values[inside] = self.cells[rc[inside, 0], rc[inside, 1]]
         return values
 
+    def walls_around(self, points_m: ArrayLike, step_m: float) -> NDArray[np.bool_]:
+        """(N,) whether the cell under a map-frame point is a wall, or one of the eight that lie `step_m` from it."""
+        step, size = max(1, round(step_m / self.resolution_m)), np.array(self.cells.shape)
+        walls = np.pad(self.cells == OCCUPIED, 3 * step)  # so that every step from a point outside ends in here, and in no wall
+        rows, cols = (np.clip(self.cells_at(points_m), -2 * step, size - 1 + 2 * step) + 3 * step).T
+        at, steps = rows * walls.shape[1] + cols, (-step, 0, step)
+        around = [walls.take(at + dr * walls.shape[1] + dc) for dr in steps for dc in steps]
+        return np.asarray(np.logical_or.reduce(around))
+
     def cropped(self, margin_cells: int = 0) -> OccupancyGrid:
         """The known part only, with a margin of unknown cells; `empty` when nothing is known."""
         known = self.known()

@@ -65,7 +65,7 @@ def witnessed(change: TakenBack, witness: OccupancyGrid, T_witness_map: SE2) -> 
     """What one other map says of the change; how much it knows is the long part, and asked only of one that sees some of it."""
     points_m = T_witness_map.apply(change.points_m)
     there = witness.values_at(points_m)
-    is_beside = _is_wall_beside(witness, points_m)
+    is_beside = witness.walls_around(points_m, witness.resolution_m)
     is_as_before = np.where(change.was_wall, is_beside, (there == FREE) & ~is_beside)
     is_exactly = np.where(change.was_wall, there == OCCUPIED, there == FREE)
     plain = int(np.count_nonzero(is_as_before & ~change.is_near))
@@ -156,10 +156,3 @@ def _is_on_lattice(a: OccupancyGrid, b: OccupancyGrid) -> bool:
 
 def _widened(walls: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(cv2.dilate(walls.astype(np.uint8), _BESIDE) > 0)
-
-
-def _is_wall_beside(grid: OccupancyGrid, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """(N,) whether a wall is at the point or one cell from it."""
-    step_m = grid.resolution_m
-    around = [np.array([dx, dy]) for dx in (-step_m, 0.0, step_m) for dy in (-step_m, 0.0, step_m)]
-    return np.asarray(np.any([grid.values_at(points_m + offset) == OCCUPIED for offset in around], axis=0))

@@ -40,7 +40,7 @@ class Problem(PoseGraph):
             np.array([index[edge.a] for edge in edges]),
             np.array([index[edge.b] for edge in edges]),
             np.array([[edge.T_a_b.x_m, edge.T_a_b.y_m, edge.T_a_b.theta_rad] for edge in edges]),
-            np.array([_information(edge.covariance) for edge in edges]),
+            _information([edge.covariance for edge in edges]),
             np.array([[frames[name].x_m, frames[name].y_m, frames[name].theta_rad] for name in names]),
         )
 
@@ -52,10 +52,9 @@ class Problem(PoseGraph):
         return {name: SE2(float(x), float(y), wrap_angle(float(t))) for name, (x, y, t) in zip(self.names, self.x, strict=True)}
 
 
-def _information(covariance: Symmetric3) -> NDArray[np.float64]:
-    """(3, 3) inverse of an edge's covariance, with the floor of what maps bend added."""
-    xx, xy, xt, yy, yt, tt = covariance
-    full = np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]])
+def _information(covariances: Sequence[Symmetric3]) -> NDArray[np.float64]:
+    """(E, 3, 3) inverses of the edges' covariances, with the floor of what maps bend added."""
+    full = np.array(covariances)[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
     return np.linalg.inv(full + np.diag([_SIGMA_M**2, _SIGMA_M**2, _SIGMA_RAD**2]))
 
 
